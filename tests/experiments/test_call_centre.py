@@ -232,7 +232,7 @@ def synthetic_results(settings):
     test = slice(problem.TEST_START + 1, None)
     for task in experiment.all_tasks(settings):
         method = task.settings["method"]
-        names = tracking.arrival_model_of(task).names
+        names = tracking.build_arrival_model(task).names
         worse = {"SQM": 1.0, "Matern": 3.0}.get(method, 2.0) * (0.9 if task.settings["what"] == "posterior" else 1.0)
         result = {}
         if task.settings["what"] == "nuts":
@@ -400,7 +400,7 @@ BOTH = experiment.CallCentreSettings(days=4, methods=("SQM",), functions=5, draw
 def test_nuts_and_weighted_draws_have_the_same_posterior():
     """Two samplers that share the density and the modes about which they start, on the fourth window, which has one."""
     task = tasks_of("nuts", BOTH)[3]
-    method, (call_window,) = tracking.arrival_model_of(task), tracking.windows_of(task)
+    method, (call_window,) = tracking.build_arrival_model(task), tracking.build_windows(task)
     draws, weights, mass = learning.sample_posterior(method, call_window.training, BOTH.draws, BOTH.seed)
     assert len(mass) == 1 and weights.reliable
     mean, covariance = importance_at_modes.moments(draws, np.exp(weights.log_weight[0]))
@@ -419,7 +419,7 @@ NOISE = 4
 def with_two_modes(count):
     """Return method, training, weighted draws and modes of the first window; the second mode is one of small noises."""
     task = tasks_of("nuts", BOTH)[0]
-    method, (call_window,) = tracking.arrival_model_of(task), tracking.windows_of(task)
+    method, (call_window,) = tracking.build_arrival_model(task), tracking.build_windows(task)
     draws, weights, mass = learning.sample_posterior(method, call_window.training, count, BOTH.seed)
     assert len(mass) == 2 and weights.reliable and method.names[NOISE] == "noise_sd"
     modes = learning.find_modes(method, call_window.training)

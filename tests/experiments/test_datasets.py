@@ -6,7 +6,7 @@ import xarray as xr
 
 from lfm_ppl.engine.task import Task
 from lfm_ppl.experiments.datasets import TaskKind, cell, row, select_prefix
-from lfm_ppl.experiments.scores import Estimate, mean_of, rate_of
+from lfm_ppl.experiments.scores import Estimate, estimate_mean, estimate_rate
 
 ENTRIES = {"dataset": "rmse, held", "dataset path": "coverage", "path time": "mean", "": "count, name"}
 
@@ -92,9 +92,9 @@ def test_a_row_has_means_shares_and_numbers():
     cells = row(dataset, {"RMSE": "rmse", "held": "held", "k > 0.7": lambda results: (results.k > 0.7).mean(),
                         "largest": lambda results: Estimate(6.0, 0.5), "kind": lambda results: "plain",
                         "count": lambda results: 3})
-    assert cells == {"RMSE": 3.0, "RMSE se": mean_of(rmse).error, "held": pytest.approx(2 / 3),
-                     "held se": rate_of(held).error, "k > 0.7": pytest.approx(1 / 3), "largest": 6.0, "largest se": 0.5,
-                     "kind": "plain", "count": 3}
+    assert cells == {"RMSE": 3.0, "RMSE se": estimate_mean(rmse).error, "held": pytest.approx(2 / 3),
+                     "held se": estimate_rate(held).error, "k > 0.7": pytest.approx(1 / 3),
+                     "largest": 6.0, "largest se": 0.5, "kind": "plain", "count": 3}
     assert type(cells["count"]) is int and type(cells["k > 0.7"]) is float
 
 

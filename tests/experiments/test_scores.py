@@ -15,7 +15,7 @@ def test_a_gaussian_posterior_has_its_closed_form(nodes):
     p = np.array([0.005, 0.5, 0.995])
     np.testing.assert_allclose(posterior.quantile(p), stats.norm.ppf(p, mean, sd), atol=2e-4 * sd + 1e-3 * sd)
     np.testing.assert_allclose([posterior.mean, posterior.sd], [mean, sd], rtol=1e-4)
-    np.testing.assert_allclose(posterior.below(mean + sd), stats.norm.cdf(1.0), atol=2e-4)
+    np.testing.assert_allclose(posterior.cdf(mean + sd), stats.norm.cdf(1.0), atol=2e-4)
     assert not posterior.is_cut_off()
 
 
@@ -24,7 +24,7 @@ def test_a_truncated_exponential_is_cut_and_right():
     posterior = scores.GridPosterior(nodes, -nodes)
     truth = stats.truncexpon(3.0)
     assert posterior.is_cut_off()
-    np.testing.assert_allclose(posterior.below(1.0), truth.cdf(1.0), atol=1e-5)
+    np.testing.assert_allclose(posterior.cdf(1.0), truth.cdf(1.0), atol=1e-5)
     np.testing.assert_allclose(posterior.mean, truth.mean(), atol=1e-5)
 
 
@@ -35,8 +35,8 @@ def test_impossible_values_have_no_posterior_mass(impossible):
     for low, high in ((-1.0, 3.0), (-1.5, 0.5), (-3.0, 2.7)):
         values = np.where((nodes < low - 0.05) | (nodes > high + 0.05), impossible, -0.5 * nodes**2)
         posterior, truth = scores.GridPosterior(nodes, values), stats.truncnorm(low, high)
-        assert posterior.below(low - 0.2) < 1e-12 and np.isfinite(posterior.density).all()
-        np.testing.assert_allclose(posterior.below(0.0), truth.cdf(0.0), atol=2e-3)
+        assert posterior.cdf(low - 0.2) < 1e-12 and np.isfinite(posterior.density).all()
+        np.testing.assert_allclose(posterior.cdf(0.0), truth.cdf(0.0), atol=2e-3)
         np.testing.assert_allclose([posterior.mean, posterior.sd], [truth.mean(), truth.std()], atol=2e-3)
 
 
@@ -46,7 +46,7 @@ def test_a_value_that_is_missing_takes_no_more_than_its_place():
     for missing in ([5], [0, 80], [76, 78]):
         posterior = scores.GridPosterior(nodes, np.where(np.isin(np.arange(81), missing), np.nan, values))
         for value in (-1.0, 0.0, 2.0):
-            assert posterior.below(value) == pytest.approx(stats.norm.cdf(value), abs=3e-4)
+            assert posterior.cdf(value) == pytest.approx(stats.norm.cdf(value), abs=3e-4)
 
 
 def test_what_is_no_posterior_is_refused():
@@ -69,16 +69,16 @@ def test_quantiles_of_cell_densities_are_those_of_the_distribution():
 
 
 def test_rates_and_their_errors():
-    assert scores.rate_of([1, 0, 0, 0]) == scores.Estimate(0.25, np.sqrt(0.25 * 0.75 / 4))
-    none = scores.rate_of(np.zeros(98))
+    assert scores.estimate_rate([1, 0, 0, 0]) == scores.Estimate(0.25, np.sqrt(0.25 * 0.75 / 4))
+    none = scores.estimate_rate(np.zeros(98))
     assert none.value == 0.0 and none.error == pytest.approx(np.sqrt(0.01 * 0.99 / 98))
-    assert np.isnan(scores.rate_of([]).value)
+    assert np.isnan(scores.estimate_rate([]).value)
 
 
 def test_means_leave_out_what_is_missing():
-    estimate = scores.mean_of([1.0, np.nan, 3.0])
+    estimate = scores.estimate_mean([1.0, np.nan, 3.0])
     assert estimate == scores.Estimate(2.0, 1.0)
-    assert np.isnan(scores.mean_of([5.0]).error)
+    assert np.isnan(scores.estimate_mean([5.0]).error)
 
 
 def test_estimates_show_as_many_digits_as_the_error_leaves():

@@ -24,7 +24,7 @@ from lfm_ppl.experiments import chains, study
 from lfm_ppl.experiments.ballistic import figures, parameters, states
 from lfm_ppl.experiments.ballistic.problem import NAMES, PATHS, RECORDS_PER_SEED, true_z
 from lfm_ppl.experiments.datasets import Column, TaskKind, row, rows, select_prefix
-from lfm_ppl.experiments.scores import paired_ratio, sd_of
+from lfm_ppl.experiments.scores import paired_ratio, sample_sd
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import TaskFactory, slug, sort_by_dataset
 
@@ -126,7 +126,7 @@ PARTICLE_FILTER: dict[str, Column] = {
     "RMSE {path} ({unit})": "rmse", "ratio {path}": lambda paired: paired_ratio(paired.exact_rmse, paired.rmse),
     "CPU s": "seconds", "times as long": lambda paired: paired.seconds.mean() / paired.exact_seconds.mean(),
     "log likelihood - Gaussian": lambda paired: paired.log_likelihood - paired.exact_log_likelihood,
-    "its sd": lambda paired: sd_of(paired.log_likelihood - paired.exact_log_likelihood)}
+    "its sd": lambda paired: sample_sd(paired.log_likelihood - paired.exact_log_likelihood)}
 """Columns of the table of particles."""
 
 DISTINCT: dict[str, Column] = {"distinct": lambda paired: paired.distinct.isel(time=0).mean()}
@@ -145,7 +145,7 @@ def summarize_parameters(data: Data) -> dict[str, Any]:
     most_likely: dict[str, Column] = {
         "truth": lambda targets: true_z()[NAMES.index(targets.parameter)],
         "maximum": "exists", "most likely": lambda targets: targets.likely[targets.exists],
-        "its sd": lambda targets: sd_of(targets.likely[targets.exists]), "posterior mean": "posterior_mean"}
+        "its sd": lambda targets: sample_sd(targets.likely[targets.exists]), "posterior mean": "posterior_mean"}
     posterior: dict[str, Column] = {
         "posterior sd": "posterior_sd", **COVERAGE, "k > 0.7": lambda targets: (targets.k > 0.7).mean()}
     return {**rows(data["parameters"], "parameter", most_likely | posterior, "log {}"),

@@ -13,7 +13,7 @@ from lfm_ppl.experiments.ballistic.problem import NAMES, PATHS, simulate_target,
 from lfm_ppl.experiments.ballistic.states import DEFAULT_RULE
 from lfm_ppl.experiments.datasets import select_prefix
 from lfm_ppl.experiments.drawing import SHADE, SPAN, TRUTH, band, bars, legend, line, patch
-from lfm_ppl.experiments.scores import Z, mean_of, paired_ratio, rate_of
+from lfm_ppl.experiments.scores import Z, estimate_mean, estimate_rate, paired_ratio
 from lfm_ppl.experiments.study import Data
 from lfm_ppl.results.plots import style
 
@@ -133,10 +133,10 @@ def plot_coverage(data: Data, *, width: str | float = "full") -> Figure:
     parameter_axes.plot([0.4, 1.0], [0.4, 1.0], color=style.BLACK, lw=0.8)
     for index, name in enumerate(NAMES):
         bars(path_axes, np.arange(len(smoothers)) + 0.12 * (index - 1),
-             [mean_of(coverage[:, index]) for coverage in smoothers.values()],
+             [estimate_mean(coverage[:, index]) for coverage in smoothers.values()],
              color=COLOURS[index], marker=MARKERS[index])
         distance = np.abs(estimates.below[:, index] - 0.5)
-        bars(parameter_axes, levels + 0.006 * (index - 1), [rate_of(distance <= level / 2) for level in levels],
+        bars(parameter_axes, levels + 0.006 * (index - 1), [estimate_rate(distance <= level / 2) for level in levels],
              color=style.CHAIN_COLOURS[3 + index], marker=MARKERS[index], label=f"log {name}")
     style.tidy(path_axes, xlabel="parameters of the smoother", ylabel="coverage of the 95% bands")
     path_axes.set_xticks(range(len(smoothers)), list(smoothers))

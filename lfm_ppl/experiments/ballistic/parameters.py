@@ -123,4 +123,4 @@ def rank_drag(target: SimulatedTarget, nodes: int = 121) -> float:
     points = np.tile(target.z, (nodes, 1))
     points[:, 0] += REACH * np.linspace(-1.0, 1.0, nodes)
     log_likelihood, _ = posterior().log_densities_of(points, target.y, batch=11)
-    return GridPosterior(points[:, 0], log_likelihood).below(target.z[0])
+    return GridPosterior(points[:, 0], log_likelihood).cdf(target.z[0])

@@ -13,7 +13,7 @@ from lfm_ppl.experiments import study
 from lfm_ppl.experiments.constrained import estimators, figures, problem
 from lfm_ppl.experiments.constrained.estimators import BANDS, FULL, METHODS, SMOOTHER
 from lfm_ppl.experiments.datasets import Column, TaskKind, merge_rows, row, rows
-from lfm_ppl.experiments.scores import SE, rate_of
+from lfm_ppl.experiments.scores import SE, estimate_rate
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import dataset_blocks, slug
 from lfm_ppl.results.importance import LARGEST_K
@@ -89,7 +89,7 @@ ERRORS: dict[str, Column] = {
     "median MSE": lambda results: results.mse.where(~results.failed).median(),
     "largest MSE": lambda results: results.mse.where(~results.failed).max(),
     "published": lambda results: METHODS[results["method"].item()].published,
-    "above 0.0103": lambda results: rate_of(
+    "above 0.0103": lambda results: estimate_rate(
         results.mse.values[~results.failed.values] > problem.PUBLISHED["delayed MHE"]),
     "lengthscale (s)": lambda results: results.lengthscale.median(),
     "least": lambda results: results.minimum.where(~results.failed).min(),

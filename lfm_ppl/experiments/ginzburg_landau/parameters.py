@@ -135,7 +135,7 @@ def outcomes(dataset: xr.Dataset) -> xr.Dataset:
     below, cut = xr.zeros_like(rows[..., 0]), xr.zeros_like(rows[..., 0], bool)
     for cell in np.ndindex(below.shape):
         posterior = scores.GridPosterior(nodes(problem.NAMES[cell[-1]], rows.sizes["node"]), rows.values[cell])
-        below[cell], cut[cell] = posterior.below(problem.TRUTH[cell[-1]]), posterior.is_cut_off()
+        below[cell], cut[cell] = posterior.cdf(problem.TRUTH[cell[-1]]), posterior.is_cut_off()
     return xr.Dataset({"below": below, "outside": (below < OUTSIDE / 2) | (below > 1 - OUTSIDE / 2), "cut": cut,
                        "seconds": dataset.seconds.sum("first") / rows.sizes["dataset"]})
 
@@ -145,9 +145,9 @@ def pooled_rate(is_outside: xr.DataArray) -> scores.Estimate:
 
     The standard error is that of the mean over realisations, since only realisations are independent.
     """
-    share = scores.mean_of(is_outside.mean("parameter"))
+    share = scores.estimate_mean(is_outside.mean("parameter"))
     spread = is_outside.any() and is_outside.sizes["dataset"] > 1
-    return share if spread else scores.Estimate(share.value, scores.rate_of(is_outside).error)
+    return share if spread else scores.Estimate(share.value, scores.estimate_rate(is_outside).error)
 
 
 def sample_posterior(task: Task) -> Result:

@@ -1,4 +1,11 @@
-"""Filtering and smoothing at the true parameters, by every method; the exact solution on a grid."""
+"""Filtering and smoothing at the true parameters by every method.
+
+1. Gaussian methods filter and smooth on the fine times, with missing observations between the data.
+2. The grid discretises the state by finite volumes. Forward and backward passes with its transition matrix give the
+   exact densities, up to the error of discretisation.
+3. Particles filter with steps of strong order 1.5, and smooth by drawing trajectories.
+4. All results become means, 95% bands, RMSE and coverage; the grid adds densities at three times.
+"""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from lfm_ppl.experiments.datasets import TaskKind
 from lfm_ppl.experiments.gps import figures, learning_methods, problem, satellite
 from lfm_ppl.experiments.gps.figures import METRE, rms
 from lfm_ppl.experiments.gps.satellite import REFUSED, compute_or_refuse
-from lfm_ppl.experiments.scores import estimate_cells, mean_of
+from lfm_ppl.experiments.scores import estimate_cells, estimate_mean
 from lfm_ppl.experiments.study import Data, Results, Study, StudyTable, setting
 from lfm_ppl.orbits import learning, magnitudes
 from lfm_ppl.orbits.arc import NOISE, Unusable
@@ -209,7 +209,7 @@ def _pool_errors(table: pd.DataFrame) -> dict[str, Any]:
     return {"satellites": len(table), "fit, median": table["fit"].median(), **errors, "median": table["LFM"].median(),
             "ratio": errors["LFM"] / errors["deterministic"], "ratio, latest": errors["LFM"] / errors["latest state"],
             "improved": int((table["LFM"] < table["deterministic"]).sum()),
-            **estimate_cells("coverage", mean_of(table["coverage"]))}
+            **estimate_cells("coverage", estimate_mean(table["coverage"]))}
 
 
 def magnitude_table(data: Data) -> pd.DataFrame:

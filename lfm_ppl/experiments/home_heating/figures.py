@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from lfm_ppl.experiments.datasets import select_prefix
 from lfm_ppl.experiments.drawing import TRUTH, band, bars, legend, line
 from lfm_ppl.experiments.home_heating import prediction, problem
-from lfm_ppl.experiments.scores import mean_of
+from lfm_ppl.experiments.scores import estimate_mean
 from lfm_ppl.experiments.study import Data
 from lfm_ppl.results.plots import style
 
@@ -137,7 +137,7 @@ def plot_scores(data: Data, *, width: str | float = "full") -> Figure:
     for (title, dataset), (rmse_axes, ell_axes) in zip(kinds.items(), grid, strict=True):
         for index, store in enumerate(stores):
             store_scores, x = dataset.sel(store=store), positions + 0.16 * (index - 0.5)
-            bars(rmse_axes, x, [mean_of(errors) for errors in store_scores.rmse], **_MARKS[store])
+            bars(rmse_axes, x, [estimate_mean(errors) for errors in store_scores.rmse], **_MARKS[store])
             low, middle, high = store_scores.ell.quantile([0.25, 0.5, 0.75], "dataset", skipna=False).values
             ell_axes.errorbar(x, middle, [middle - low, high - middle], ls="", ms=3.0, elinewidth=0.8, capsize=1.5,
                               **_MARKS[store])

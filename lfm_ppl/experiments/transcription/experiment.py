@@ -22,7 +22,7 @@ from lfm_ppl.engine.task import Result, Task
 from lfm_ppl.experiments import published, scores, study
 from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row
 from lfm_ppl.experiments.published import PublishedComparison
-from lfm_ppl.experiments.scores import mean_of
+from lfm_ppl.experiments.scores import estimate_mean
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import dataset_blocks, dataset_indices
 from lfm_ppl.experiments.transcription import approximations, figures, problem, slices
@@ -144,7 +144,7 @@ def published_rows(data: Data) -> dict[str, Any]:
         cells: dict[str, Any] = {"no mode": float((~at_mode).sum())}
         for method, (error, diverged) in problem.PUBLISHED[label].items():
             ours = dataset.sel({"method": method})
-            means = mean_of(ours.rmse), mean_of(ours.rmse[at_mode])
+            means = estimate_mean(ours.rmse), estimate_mean(ours.rmse[at_mode])
             z, z_at_modes = ((mean.value - error) / mean.error for mean in means)
             cells |= {**cell(method, ours.rmse), f"{method} published": error, f"{method} z": z,
                       f"{method} verdict": str(PublishedComparison(z)), f"{method} div.": float(ours.diverged.sum()),
