@@ -336,13 +336,9 @@ def test_blocks_of_more_data_sets_hold_those_of_fewer():
     assert few.items() <= many.items() and len(few) == 2 * 8 * len(experiment.METHODS)
 
 
-def test_mistakes():
-    with pytest.raises(ValueError, match="datasets must be at least 1"):
-        experiment.TranscriptionSettings(datasets=0)
+def test_invalid_settings():
     with pytest.raises(ValueError, match="burn_in must lie in"):
         experiment.TranscriptionSettings(draws=100, burn_in=200)
-    with pytest.raises(ValueError, match="must be a tuple of different labels"):
-        experiment.TranscriptionSettings(configurations="exponential")
     with pytest.raises(ValueError, match="gamma, the saturation constant, must be positive"):
         problem.data_set(problem.Configuration("saturation", -0.1), 0)
     with pytest.raises(ValueError, match="link must be one of .*, got 'cubic'"):

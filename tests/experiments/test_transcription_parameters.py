@@ -102,21 +102,6 @@ def test_the_figures_are_labelled():
         assert [text.get_text() for text in upper.get_xticklabels()] == list(parameters.NAMES)
 
 
-def test_mistakes():
-    with pytest.raises(ValueError, match="datasets must be at least 1"):
-        parameters_report.TranscriptionParametersSettings(datasets=0)
-    with pytest.raises(ValueError, match="unknown links 'cubic'"):
-        parameters_report.TranscriptionParametersSettings(links=("cubic",))
-    with pytest.raises(ValueError, match="a tuple of different labels"):
-        parameters_report.TranscriptionParametersSettings(links=())
-    with pytest.raises(ValueError, match="chains, warm-up, draws and thinning"):
-        parameters_report.TranscriptionParametersSettings(nuts=(2, 10, 10))
-    with pytest.raises(ValueError, match="ram: chains must be at least 1"):
-        parameters_report.TranscriptionParametersSettings(ram=(0, 1, 1, 1))
-    with pytest.raises(ValueError, match="tree_depth must be at least 1"):
-        parameters_report.TranscriptionParametersSettings(tree_depth=0)
-
-
 def settings_of(label, chains, warmup, draws, thin):
     """Settings of one task."""
     return {"sampler": label, "link": "softplus", "gamma": None, "index": 0, "chains": chains, "warmup": warmup,
