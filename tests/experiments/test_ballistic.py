@@ -59,7 +59,7 @@ def test_the_densities_are_those_of_the_model():
 
 @pytest.mark.slow
 def test_a_gaussian_smoother_tracks():
-    """Its errors are those of its own mean, and its band is honest about them."""
+    """The errors belong to the stored mean, and the band covers them."""
     (task,) = [entry for entry in tasks_of("tracking", SMALL) if entry.settings["method"] == "Taylor"]
     result = states.run_gaussian(task)
     target = simulate_target(0)
@@ -135,9 +135,9 @@ def synthetic_results(settings):
         count = inputs["last"] - inputs["first"] + 1
         if inputs["what"] == "tracking":
             result = {"filter_rmse": np.full((count, 3), 2.0), "smoother_rmse": np.tile([50.0, 30.0, 20.0], (count, 1)),
-                     "smoother_coverage": np.full((count, 3), 0.95), "log_likelihood": np.full(count, -601.0),
-                     "filter_seconds": np.full(count, 1e-3), "smoother_seconds": np.full(count, 2e-3),
-                     "mean": simulate_target(0).paths, "sd": np.ones((3, 120))}
+                      "smoother_coverage": np.full((count, 3), 0.95), "log_likelihood": np.full(count, -601.0),
+                      "filter_seconds": np.full(count, 1e-3), "smoother_seconds": np.full(count, 2e-3),
+                      "mean": simulate_target(0).paths, "sd": np.ones((3, 120))}
         else:
             total = settings.drawn_runs if inputs["what"] == "drawn" else settings.runs
             below = (np.arange(inputs["first"], inputs["last"] + 1)[:, None] + 0.5) / total * np.ones(3)
@@ -145,12 +145,12 @@ def synthetic_results(settings):
                 results[task.name] = {"below": below[:, 0]}
                 continue
             result = {"likely": true_z() + np.zeros((count, 3)), "exists": np.arange(count) > 0,
-                     "posterior_mean": true_z() + np.zeros((count, 3)),
-                     "posterior_sd": np.full((count, 3), 0.1), "below": below, "k": np.full(count, 0.2),
-                     "ess": np.full(count, 300.0), "seconds": np.full(count, 0.5),
-                     "draws": true_z()[:, None] + 0.1 * generator.normal(size=(3, 200)),
-                     **{f"{kind}_{name}": np.full((count, 3), 0.9) for kind in ("likely", "posterior")
-                        for name in ("rmse", "coverage")}}
+                      "posterior_mean": true_z() + np.zeros((count, 3)),
+                      "posterior_sd": np.full((count, 3), 0.1), "below": below, "k": np.full(count, 0.2),
+                      "ess": np.full(count, 300.0), "seconds": np.full(count, 0.5),
+                      "draws": true_z()[:, None] + 0.1 * generator.normal(size=(3, 200)),
+                      **{f"{kind}_{name}": np.full((count, 3), 0.9) for kind in ("likely", "posterior")
+                         for name in ("rmse", "coverage")}}
         results[task.name] = result
     return results
 
@@ -167,7 +167,7 @@ def test_tables_summarize_results():
     tracked = tables["tracking"]
     assert list(tracked.index) == [
         *states.RULES, *(f"cubature, {label}{end}" for end in ("", "; parameters drawn from the prior")
-                            for label in experiment.UNKNOWN)]
+                         for label in experiment.UNKNOWN)]
     assert tracked.loc["Taylor", "RMSE speed (m/s)"] == 30.0 and tracked.loc["cubature", "coverage u"] == 0.95
     particle_table = tables["particles"]
     row = particle_table.loc["smoother, 1,000 particles"]

@@ -1,4 +1,4 @@
-"""Queues of a call centre as an experiment: counts, the queue that they make, scores, tables and figures."""
+"""Call centre study: counts, queues, scores, tables and figures."""
 
 import dataclasses
 import os
@@ -9,15 +9,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from scipy import integrate, special, stats
+from scipy import integrate, stats
 
-import lfm_ppl as lfm
 from lfm_ppl.engine.store import write
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.call_centre import counts, experiment, figures, learning, problem, tracking
+from lfm_ppl.experiments.call_centre import counts, experiment, figures, problem, tracking
 from lfm_ppl.experiments.study import TASKS
-from lfm_ppl.inference.optimise import End, Objective
-from lfm_ppl.results import importance_at_modes
 
 DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="the counts of real calls are not there (LFM_DATA)")
@@ -31,7 +28,7 @@ def tasks_of(kind, settings):
     return [task for task in experiment.all_tasks(settings) if task.settings["what"] == kind]
 
 
-def written(path, change=lambda table: table):
+def write_counts(path, change=lambda table: table):
     """Write two days of counts as a file."""
     times = [pd.Timestamp(day) + pd.Timedelta(minutes=5 * k + 420)
              for day in ("2003-03-06", "2003-03-13") for k in range(169)]
@@ -42,7 +39,7 @@ def written(path, change=lambda table: table):
 
 
 def test_counts_are_read_day_by_day(tmp_path):
-    days = counts.read(written(tmp_path / counts.FILE))
+    days = counts.read(write_counts(tmp_path / counts.FILE))
     assert days.dates.astype(str).tolist() == ["2003-03-06", "2003-03-13"]
     np.testing.assert_array_equal(days.calls, [np.arange(168), 169 + np.arange(168)])
     assert len(counts.read(tmp_path).select_weekday("Thursday").dates) == 2
@@ -65,9 +62,9 @@ def set_cell(row, column, value):
     (set_cell(7, "DateTime", "2003-03-05T07:00:00Z"), "row 9.*a later time than before"),
     (lambda table: table.drop(index=20), "2003-03-06 has 167"),
 ])
-def test_counts_that_cannot_be_used(tmp_path, change, message):
+def test_invalid_counts(tmp_path, change, message):
     with pytest.raises(ValueError, match=message):
-        counts.read(written(tmp_path / "calls.csv", change))
+        counts.read(write_counts(tmp_path / "calls.csv", change))
     with pytest.raises(FileNotFoundError, match="there is no file"):
         counts.read(tmp_path / "none")
 
@@ -81,7 +78,7 @@ def test_the_queue_solves_its_equation():
     expected = [0.0]
     for zeta, omega in zip(arrivals, service, strict=True):
         solution = integrate.solve_ivp(lambda t, x: zeta - omega * x / (1 + x), (0, 5), expected[-1:],  # noqa: B023
-                                  method="DOP853", rtol=1e-11, atol=1e-12)
+                                       method="DOP853", rtol=1e-11, atol=1e-12)
         expected.append(solution.y[0, -1])
     np.testing.assert_allclose(path, expected, rtol=1e-7, atol=2e-6)
 
@@ -141,91 +138,6 @@ def test_the_bound_on_settling_matters_little():
             assert name == "changed" or np.sqrt(np.mean(off**2)) < 0.4 * problem.NOISE
 
 
-@pytest.mark.slow
-def test_the_densities_are_those_of_the_model():
-    """The prior against scipy's, the likelihood against that of the model built by hand."""
-    method, call_window = problem.ArrivalModel("matern"), window()
-    assert method.names == ("mean", "scale", "lengthscale", "noise_sd")
-    z = np.log([6.5, 2.0, 100.0, 0.6])
-    log_likelihood, log_prior = problem.posterior(method).log_densities(z, call_window.training)
-    medians, spread = np.log([6.0, 2.0, 168.0, 0.5]), np.array([0.5, 0.7, 0.7, 0.7])
-    assert log_prior == pytest.approx(stats.norm(medians, spread).logpdf(z).sum(), rel=1e-9)
-    m = sys.modules[problem.model_file().model.__module__]
-    system = m.build(6.5, 2.0, 0.6, 100.0, force="matern", service=problem.SERVICE_RATE)
-    likelihood = lfm.MarginalLikelihood(system, problem.TRAINING_TIMES, steps=m.STEPS)
-    assert log_likelihood == pytest.approx(float(likelihood.log_prob(call_window.training)), rel=1e-9)
-
-
-@pytest.mark.slow
-def test_the_gradient_is_that_of_finite_differences():
-    method, call_window = problem.ArrivalModel("matern"), window()
-    objective = problem.posterior(method).objective(call_window.training)
-    z = np.log([6.5, 2.0, 150.0, 0.8])
-    _, gradient = objective.value_and_gradient(z)
-    steps = 1e-5 * np.eye(4)
-    expected = [(objective.value(z + step) - objective.value(z - step)) / 2e-5 for step in steps]
-    np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-5)
-    (best, *_), _ = learning.run_searches(method, call_window.training)
-    assert best.value < problem.posterior(method).objective(call_window.training, 0.0).value(z)
-
-
-def searched(monkeypatch, value_and_gradient):
-    """Let searches be of ``value_and_gradient(z, prior)``, in the place of the posterior."""
-
-    class Posterior:
-        def objective(self, y, prior=1.0):
-            return Objective(lambda z: value_and_gradient(np.asarray(z), prior))
-
-    monkeypatch.setattr(problem, "posterior", lambda method: Posterior())
-
-
-@pytest.mark.slow
-def test_searches_from_several_starts_find_several_modes(monkeypatch):
-    """Three wells, one of them far higher than the others."""
-    method = problem.ArrivalModel("sqm")
-    starts = np.log([[start[name] for name in method.names] for start in learning.STARTS])
-    wells, depth, evaluated = starts + 0.05, np.array([3.0, -2.0, 30.0]), []
-
-    def value_and_gradient(z, prior):
-        k = np.argmin(((z - wells) ** 2).sum(axis=1))
-        evaluated.append(k)
-        return 20 * ((z - wells[k]) ** 2).sum() + depth[k] + prior, 40 * (z - wells[k])
-
-    searched(monkeypatch, value_and_gradient)
-    modes = learning.find_modes(method, np.zeros((63, 1)))
-    np.testing.assert_allclose([mode.point for mode in modes], wells[[1, 0]], atol=1e-4)
-    assert [-mode.value for mode in modes] == pytest.approx([1.0, -4.0])
-    evaluated.clear()
-    (best, *_), evaluations = learning.run_searches(method, np.zeros((63, 1)))
-    np.testing.assert_array_equal(best.point, modes[0].point)
-    assert -best.value == pytest.approx(2.0)
-    assert set(evaluated) == {0, 1, 2} and evaluations == len(evaluated)
-    depth[:], wells[:] = 0.0, wells[0]
-    assert len(learning.find_modes(method, np.zeros((63, 1)))) == 1
-    searched(monkeypatch, lambda z, prior: (np.inf, np.zeros(len(method.names))))
-    with pytest.raises(ValueError, match="not finite at any start of the searches for sqm"):
-        learning.run_searches(method, np.zeros((63, 1)))
-
-
-def test_a_lower_mode_without_curvature_is_none(monkeypatch):
-    """The second of three lies on a saddle; where the gradient about the third is not a number, it is left out, too."""
-    method = problem.ArrivalModel("matern")
-    points = [np.full(4, value) for value in (0.0, 3.0, 6.0)]
-
-    def value_and_gradient(z, prior):
-        k = int(np.argmin([np.abs(z - point).max() for point in points]))
-        signs = np.array([1.0, 1.0, 1.0, -1.0 if k == 1 else 1.0]) * (np.nan if k == 2 else 1.0)
-        return 0.5 * signs @ (z - points[k]) ** 2, signs * (z - points[k])
-
-    searched(monkeypatch, value_and_gradient)
-    for order, expected in (([0, 1, 2], [0]), ([1, 0, 2], [1, 0])):
-        monkeypatch.setattr(learning, "run_searches", lambda *_, order=order, **__: (
-            [End(points[k], 0.0) for k in order], 3))
-        modes = learning.find_modes(method, np.zeros((63, 1)))
-        np.testing.assert_array_equal([mode.point for mode in modes], [points[k] for k in expected])
-    np.testing.assert_allclose(modes[1].curvature.factor @ modes[1].curvature.factor.T, np.eye(4), atol=1e-6)
-
-
 def synthetic_results(settings):
     """Results of every task: bands that hold all, and errors that follow from the method."""
     call_window, results = window(), {}
@@ -243,23 +155,23 @@ def synthetic_results(settings):
         for name in problem.TEST_RATES:
             rmse = worse * (1.0 + 0.1 * np.arange(settings.days))
             result |= {f"{name}_rmse": rmse, f"{name}_ell": -100.0 * rmse, f"{name}_rate_rmse": 0.1 * rmse,
-                      f"{name}_coverage": np.full(settings.days, 0.94),
-                      f"{name}_rate_coverage": np.full(settings.days, 0.9)}
+                       f"{name}_coverage": np.full(settings.days, 0.94),
+                       f"{name}_rate_coverage": np.full(settings.days, 0.9)}
             if task.settings["what"] == "track":
                 x = np.log1p(call_window.queues[name])
                 result |= {f"{name}_log_queue": x, f"{name}_log_queue_sd": np.full(x.shape, 0.2),
-                          f"{name}_arrivals": np.append(0, call_window.arrivals),
-                          f"{name}_arrivals_sd": np.ones(x.shape)}
+                           f"{name}_arrivals": np.append(0, call_window.arrivals),
+                           f"{name}_arrivals_sd": np.ones(x.shape)}
         if task.settings["what"] == "track":
             result |= {"z": np.zeros((settings.days, len(names))), "log_likelihood": np.full(settings.days, -50.0),
-                      "evaluations": np.full(settings.days, 40), "seconds": np.full(settings.days, 2.0)}
+                       "evaluations": np.full(settings.days, 40), "seconds": np.full(settings.days, 2.0)}
         else:
             result |= {"k": np.full(settings.days, 0.3), "ess": np.full(settings.days, 90.0),
-                      "modes": np.arange(1, settings.days + 1), "beyond": 0.2 * np.arange(settings.days),
-                      "posterior_mean": np.zeros((settings.days, len(names))),
-                      "posterior_sd": np.ones((settings.days, len(names))),
-                      "shapes": np.append(0, call_window.arrivals),
-                      "shapes_sd": np.ones(call_window.queues["constant"].shape)}
+                       "modes": np.arange(1, settings.days + 1), "beyond": 0.2 * np.arange(settings.days),
+                       "posterior_mean": np.zeros((settings.days, len(names))),
+                       "posterior_sd": np.ones((settings.days, len(names))),
+                       "shapes": np.append(0, call_window.arrivals),
+                       "shapes_sd": np.ones(call_window.queues["constant"].shape)}
         results[task.name] = result
     assert test.start == 505
     return results
@@ -273,7 +185,7 @@ def test_scores_are_those_of_the_log_normal_distribution():
     call_window = window()
     x = np.log1p(call_window.queues["constant"])
     estimate = tracking.QueueEstimate(x + 0.1, np.full(x.shape, 0.1), np.append(0, call_window.arrivals) + 0.2,
-                                   np.full(x.shape, 0.05))
+                                      np.full(x.shape, 0.05))
     mixture_scores = tracking.score_mixture([estimate], call_window, "constant")
     queue = call_window.queues["constant"][505:]
     assert mixture_scores["rmse"] == pytest.approx(np.sqrt(np.mean(((1 + queue) * (np.exp(0.1) - 1)) ** 2)))
@@ -291,7 +203,7 @@ def synthetic_data(settings):
     return experiment.STUDY.collect(settings, synthetic_results(settings))
 
 
-def test_the_tables_hold_what_was_found():
+def test_tables_summarize_results():
     tables = {name: table.frame for name, table in experiment.tables(SYNTHETIC, synthetic_data(SYNTHETIC)).items()}
     table = tables["constant"]
     assert list(table.index) == ["SQM", "periodic", "Matern", "SQM, parameters integrated out"]
@@ -311,17 +223,13 @@ def test_the_tables_hold_what_was_found():
     assert learnt.loc["SQM", "memory"] == 1.0 and np.isnan(learnt.loc["Matern", "memory"])
 
 
-def test_the_figures_are_drawn_and_labelled():
+def test_figures():
     all_figures = figures.draw(SYNTHETIC, synthetic_data(SYNTHETIC))
     assert list(all_figures) == ["queue-constant", "queue-changed", "arrivals", "cycles", "errors"]
-    for figure in all_figures.values():
-        assert figure.get_figwidth() == 7.0 and figure.legends
-        for axes in figure.axes:
-            assert axes.get_ylabel()
 
 
 @pytest.mark.slow
-def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
+def test_stored_results_are_tabulated_without_computing(tmp_path):
     results = synthetic_results(SYNTHETIC)
     for task in experiment.all_tasks(SYNTHETIC):
         write(task, results[task.name], tmp_path / TASKS)
@@ -339,15 +247,9 @@ def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
         experiment.STUDY.run(dataclasses.replace(SYNTHETIC, seed=1), tmp_path)
 
 
-def test_mistakes(tmp_path):
-    for wrong, message in (({"days": 0}, "days must be at least 1"), ({"methods": ("SQN",)}, "SQM"),
-                           ({"integrated": ("CQM",), "methods": ("SQM",)}, "integrated"),
-                           ({"nuts": (2, 10)}, "nuts must be chains, warm-up and draws"),
-                           ({"nuts": (2, 0, 10)}, "nuts: warm-up must be at least 1"),
-                           ({"integrated": "SQM"}, "a tuple of different labels, at least one"),
-                           ({"weekday": "Thrusday"}, "Did you mean 'Thursday'"), ({"link": "log"}, "link")):
-        with pytest.raises(ValueError, match=message):
-            experiment.CallCentreSettings(**wrong)
+def test_invalid_settings(tmp_path):
+    with pytest.raises(ValueError, match="integrated"):
+        experiment.CallCentreSettings(integrated=("CQM",), methods=("SQM",))
     with pytest.raises(ValueError, match="there are 31 test days on a Thursday, but 40 are requested"):
         experiment.STUDY.run(experiment.CallCentreSettings(days=40), tmp_path)
     with pytest.raises(FileNotFoundError, match="there is no file"):
@@ -355,113 +257,10 @@ def test_mistakes(tmp_path):
 
 
 @pytest.mark.slow
-def test_weighted_draws_are_those_of_a_long_chain():
-    """The posterior of one window against random-walk Metropolis with the same density."""
-    method, call_window = problem.ArrivalModel("sqm", functions=5), window()
-    draws, weights, _ = learning.sample_posterior(method, call_window.training, 1_000, 0)
-    weight = np.exp(weights.log_weight[0])
-    mean = weight @ draws
-    sd = np.sqrt(weight @ (draws - mean) ** 2)
-
-    def density(z):
-        return np.sum(problem.posterior(method).log_densities_of(z, call_window.training), axis=0)
-
-    factor = np.linalg.cholesky((draws - mean).T @ ((draws - mean) * weight[:, None]))
-    generator = np.random.default_rng(0)
-    positions = mean + generator.normal(size=(20, 5)) @ factor.T
-    value, samples = density(positions), []
-    for _ in range(600):
-        proposed = positions + 2.4 / np.sqrt(5) * generator.normal(size=positions.shape) @ factor.T
-        new = density(proposed)
-        accept = np.log(generator.uniform(size=20)) < new - value
-        positions, value = np.where(accept[:, None], proposed, positions), np.where(accept, new, value)
-        samples.append(positions)
-    chain = np.array(samples[100:])
-    error = chain.mean(axis=0).std(axis=0) / np.sqrt(20) + sd / np.sqrt(float(np.ravel(weights.ess)[0]))
-    np.testing.assert_array_less(np.abs(chain.mean(axis=(0, 1)) - mean), 4 * error)
-
-
-@pytest.mark.slow
-def test_the_quick_version_runs_from_end_to_end(tmp_path):
+def test_quick_version(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", counts.OverloadWarning)
         study_result = experiment.STUDY.run(experiment.CallCentreSettings.quick(days=1), tmp_path)
     written = experiment.STUDY.save(study_result, tmp_path)
     assert len(written) == 15 and all(path.stat().st_size > 0 for path in written)
     assert len(study_result.printed) == 5
-
-
-BOTH = experiment.CallCentreSettings(days=4, methods=("SQM",), functions=5, draws=2_000, mixed=5, nuts_days=4,
-                                     nuts=(2, 300, 700))
-"""Weighted draws and NUTS, on simulated days."""
-
-
-@pytest.mark.slow
-def test_nuts_and_weighted_draws_have_the_same_posterior():
-    """Two samplers that share the density and the modes about which they start, on the fourth window, which has one."""
-    task = tasks_of("nuts", BOTH)[3]
-    method, (call_window,) = tracking.build_arrival_model(task), tracking.build_windows(task)
-    draws, weights, mass = learning.sample_posterior(method, call_window.training, BOTH.draws, BOTH.seed)
-    assert len(mass) == 1 and weights.reliable
-    mean, covariance = importance_at_modes.moments(draws, np.exp(weights.log_weight[0]))
-    result = tracking.track_by_nuts(task)
-    assert result["divergences"] == 0 and result["r_hat"].max() < 1.02
-    error = np.sqrt(1 / result["ess"] + 1 / weights.ess)
-    assert error.max() < 0.1
-    assert (np.abs(result["mean"] - mean) < 4 * error * result["sd"]).all()
-    np.testing.assert_allclose(result["sd"], np.sqrt(np.diag(covariance)), rtol=4 * error.max())
-
-
-NOISE = 4
-"""Index of a parameter."""
-
-
-def with_two_modes(count):
-    """Return method, training, weighted draws and modes of the first window; the second mode is one of small noises."""
-    task = tasks_of("nuts", BOTH)[0]
-    method, (call_window,) = tracking.build_arrival_model(task), tracking.build_windows(task)
-    draws, weights, mass = learning.sample_posterior(method, call_window.training, count, BOTH.seed)
-    assert len(mass) == 2 and weights.reliable and method.names[NOISE] == "noise_sd"
-    modes = learning.find_modes(method, call_window.training)
-    return method, call_window.training, draws, np.exp(weights.log_weight[0]), modes
-
-
-@pytest.mark.slow
-def test_weighted_draws_see_a_second_mode():
-    """Its share of the posterior, against draws of one wide proposal over both modes."""
-    method, y, draws, weight, (first, second) = with_two_modes(4_000)
-    edge = 0.5 * (first.point + second.point)[NOISE]
-    below = draws[:, NOISE] < edge
-    share = weight[below].sum()
-    error = np.sqrt((weight**2 * (below - share) ** 2).sum())
-
-    scale = np.abs(first.point - second.point) / 2 + np.linalg.norm(first.curvature.factor, axis=1)
-    wide = stats.multivariate_t(0.5 * (first.point + second.point), np.diag(scale**2), df=5)
-    proposals = wide.rvs(60_000, random_state=1)
-    log_ratio = np.sum(problem.posterior(method).log_densities_of(proposals, y), axis=0) - wide.logpdf(proposals)
-    log_ratio = np.where(np.isfinite(log_ratio), log_ratio, -np.inf)
-    plain, is_below = np.exp(log_ratio - special.logsumexp(log_ratio)), proposals[:, NOISE] < edge
-    expected = plain[is_below].sum()
-    apart = np.hypot(error, np.sqrt((plain**2 * (is_below - expected) ** 2).sum()))
-    assert abs(share - expected) < 4 * apart and apart < share / 2
-
-
-@pytest.mark.slow
-def test_nuts_and_weighted_draws_agree_about_the_first_mode():
-    """NUTS comes to the second one by chance, and then stays for a hundred draws: it cannot tell how much is there."""
-    method, _, draws, weight, (first, second) = with_two_modes(4_000)
-    edge = 0.5 * (first.point + second.point)[NOISE]
-    above = draws[:, NOISE] > edge
-    assert weight[above].sum() > 0.98
-    shares = weight[above] / weight[above].sum()
-    mean, covariance = importance_at_modes.moments(draws[above], shares)
-    sd = np.sqrt(np.diag(covariance))
-    result = tracking.track_by_nuts(tasks_of("nuts", BOTH)[0])
-    elsewhere = result["draws"][NOISE] < edge
-    assert elsewhere.mean() < 0.5
-    chain = result["draws"][:, ~elsewhere]
-    ess = scores.diagnose(method.names, chain[:, None])["ess"]
-    error = np.sqrt(1 / ess + (shares**2).sum())
-    assert error.max() < 0.1
-    assert (np.abs(chain.mean(axis=1) - mean) < 4 * error * sd).all()
-    np.testing.assert_allclose(chain.std(axis=1), sd, rtol=4 * error.max())

@@ -120,7 +120,7 @@ def test_the_rate_as_a_constant_state_against_a_search_on_the_dense_cost():
     times = np.linspace(0.0, 6.0, 25)
     y = problem.record("half sines", 1).y[:601:25]
     estimate = lfm.full_information(problem.companion(1.0, jnp.zeros(3), learnt=True), times, y, grid=times, steps=16,
-                                 lower={"factor": 0.0, "rate": 0.0}, tolerance=1e-11)
+                                    lower={"factor": 0.0, "rate": 0.0}, tolerance=1e-11)
     rate = float(estimate.state("rate")[0])
     assert estimate.converged and np.ptp(estimate.state("rate")) < 1e-9 and np.asarray(estimate.active)[:, 0].any()
     best = minimize_scalar(lambda candidate: dense_cost(candidate, rate, np.sqrt(3.0), times, y[:, 0])[0],
@@ -148,21 +148,21 @@ def store_results(folder, settings):
             result = {"truth": path[0]}
             for method, (_, parameters, spacing, _) in estimators.METHODS.items():
                 result |= {f"{method}/mse": random.uniform(1e-3, 1e-2, count), f"{method}/minimum": np.zeros(count),
-                          f"{method}/coverage": np.full(count, 0.95), f"{method}/failed": np.zeros(count, bool),
-                          f"hyperparameters/{parameters}": np.ones((count, 2)),
-                          f"{method}/first": np.sort(path, axis=0)[[1, 0, 2], ::spacing]}
+                           f"{method}/coverage": np.full(count, 0.95), f"{method}/failed": np.zeros(count, bool),
+                           f"hyperparameters/{parameters}": np.ones((count, 2)),
+                           f"{method}/first": np.sort(path, axis=0)[[1, 0, 2], ::spacing]}
         elif kind == "ballistic":
             paths = random.normal(size=(3, len(problem.TARGET_TIMES)))
             result = {"rmse": random.uniform(size=(count, 3)), "converged": np.ones(count, bool), "estimate": paths,
-                     "truth": paths}
+                      "truth": paths}
         else:
             times, hours = np.linspace(0.0, 24.0, 51), np.arange(25.0)
             paths = np.abs(random.normal(size=(count, 51)))
             result = {"times": times, "truth": paths, "mode": paths, "low": 0.5 * paths, "high": 2 * paths,
-                     "coverage": np.ones(count), "peak": random.uniform(0.0, 2.0, (count, 2)), "rmse": np.ones(count),
-                     "k": np.where(np.arange(count) == 0, np.inf, 0.2),
-                     "converged": np.ones(count, bool), "bands_converged": np.ones(count, bool),
-                     "y": random.normal(size=(25, 3)), "measured": hours}
+                      "coverage": np.ones(count), "peak": random.uniform(0.0, 2.0, (count, 2)), "rmse": np.ones(count),
+                      "k": np.where(np.arange(count) == 0, np.inf, 0.2),
+                      "converged": np.ones(count, bool), "bands_converged": np.ones(count, bool),
+                      "y": random.normal(size=(25, 3)), "measured": hours}
         write(task, result, Path(folder) / TASKS, overwrite=False)
 
 
@@ -202,14 +202,14 @@ def test_the_rate_of_the_first_window_is_where_the_dense_cost_is_least():
 
 @pytest.mark.slow
 def test_a_window_starts_from_the_earlier_estimate():
-    """Rows of the source's estimator are those of windows solved one by one, from the printed arrival means."""
+    """Rows of the source's estimator equal separate solutions of windows from the printed arrival means."""
     y = problem.record("half sines", 0).y
     path = np.asarray(estimators.horizon(jnp.array([1.0]), y))
     times = problem.TIMES[:61]
     for begin in (0, 1, 31, 700, 1440):
         mean = path[begin] if begin else np.zeros(3)
         window = lfm.full_information(problem.companion(1.0, mean), times, y[begin: begin + 61],
-                                     lower={"factor": 0.0}, grid=times).state_mean
+                                      lower={"factor": 0.0}, grid=times).state_mean
         np.testing.assert_allclose(path[begin + 30], window[30], atol=1e-4)
     assert path[:, 1].min() >= 0.0
 

@@ -70,7 +70,7 @@ def test_tables_measure_against_the_reference(monkeypatch):
 
 
 def test_sites_that_did_not_converge_show_and_shorter_data_do_not(monkeypatch):
-    """Both are NaN; data of four rows stand beside those of another problem with six."""
+    """Both are NaN: a problem with four rows is padded to the six rows of another."""
     settings, results = synthetic_results(monkeypatch)
     results["student-t/laplace"] |= {"mean": np.array([0.0, np.nan, 0.2, 0.0])}
     data = dict(experiment.STUDY.collect(settings, results))

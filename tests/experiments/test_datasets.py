@@ -90,8 +90,8 @@ def test_a_row_has_means_shares_and_numbers():
     rmse, held = np.array([1.0, 2.0, 6.0]), np.array([True, True, False])
     dataset = xr.Dataset({"rmse": ("dataset", rmse), "held": ("dataset", held), "k": ("dataset", [0.1, 0.2, 0.9])})
     cells = row(dataset, {"RMSE": "rmse", "held": "held", "k > 0.7": lambda results: (results.k > 0.7).mean(),
-                        "largest": lambda results: Estimate(6.0, 0.5), "kind": lambda results: "plain",
-                        "count": lambda results: 3})
+                          "largest": lambda results: Estimate(6.0, 0.5), "kind": lambda results: "plain",
+                          "count": lambda results: 3})
     assert cells == {"RMSE": 3.0, "RMSE se": estimate_mean(rmse).error, "held": pytest.approx(2 / 3),
                      "held se": estimate_rate(held).error, "k > 0.7": pytest.approx(1 / 3),
                      "largest": 6.0, "largest se": 0.5, "kind": "plain", "count": 3}
@@ -100,7 +100,7 @@ def test_a_row_has_means_shares_and_numbers():
 
 def test_a_name_stands_for_a_column_of_each_entry():
     dataset = xr.Dataset({"rmse": (("dataset", "path"), np.array([[1.0, 10.0], [3.0, 30.0]]))},
-                       {"path": ["x", "v"], "unit": ("path", ["m", "m/s"])})
+                         {"path": ["x", "v"], "unit": ("path", ["m", "m/s"])})
     assert list(row(dataset, {"RMSE {path} ({unit})": "rmse"})) == [
         "RMSE x (m)", "RMSE x (m) se", "RMSE v (m/s)", "RMSE v (m/s) se"]
     assert row(dataset, {"{path}": lambda results: results.rmse.max()}) == {"x": 3.0, "v": 30.0}

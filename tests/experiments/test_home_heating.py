@@ -127,20 +127,20 @@ def synthetic_results(settings):
         if kind == "homes":
             rmse = 0.5 + 0.1 * index + 0.01 * np.arange(settings.homes)
             result = {"rmse": rmse, "ell": -100 * rmse, "inside": np.full(settings.homes, 0.9),
-                     "mean": np.full((settings.homes, 144), 18.0), "on": generator.uniform(size=(settings.homes, 144)),
-                     "quantiles": 18.0 + np.linspace(-1, 1, 5)[:, None] * np.ones(144)}
+                      "mean": np.full((settings.homes, 144), 18.0), "on": generator.uniform(size=(settings.homes, 144)),
+                      "quantiles": 18.0 + np.linspace(-1, 1, 5)[:, None] * np.ones(144)}
         elif kind == "house":
             count = task.settings["windows"]
             rmse = 0.3 + 0.1 * index + 0.01 * np.arange(count)
             result = {f"{prediction_kind}_{name}": value for prediction_kind in ("ahead", "track", "blind")
-                     for name, value in (("rmse", rmse), ("ell", -20 * rmse), ("inside", np.full(count, 0.95)))}
+                      for name, value in (("rmse", rmse), ("ell", -20 * rmse), ("inside", np.full(count, 0.95)))}
             result |= {"mean": np.full((count, 24), 19.0), "sd": np.ones((count, 24)),
-                      "residual": generator.normal(size=120), "residual_sd": np.ones(120)}
+                       "residual": generator.normal(size=120), "residual_sd": np.ones(120)}
         else:
             result = {"ell": np.array([-4.0, -8.0]), "point_ell": np.array([-5.0, -11.0]), "rmse": np.ones(2),
-                     "point_rmse": np.ones(2), "r_hat": np.full(2, 1.01), "ess": np.full(2, 300.0),
-                     "mean": np.full((2, 6), 0.1 if task.settings["sampler"] == "NUTS" else 0.0),
-                     "sd": np.full((2, 6), 0.5), "divergences": np.ones(2), "seconds": np.full(2, 7.0)}
+                      "point_rmse": np.ones(2), "r_hat": np.full(2, 1.01), "ess": np.full(2, 300.0),
+                      "mean": np.full((2, 6), 0.1 if task.settings["sampler"] == "NUTS" else 0.0),
+                      "sd": np.full((2, 6), 0.5), "divergences": np.ones(2), "seconds": np.full(2, 7.0)}
         results[task.name] = {**result, "cpu_s": 2.0}
     return results
 
@@ -165,7 +165,7 @@ def test_tables_and_figures_with_the_real_house(window, tmp_path):
     settings = experiment.HomeHeatingSettings(data=str(REAL), homes=2, windows=3, methods=SMALL.methods, every=2)
     results = experiment.STUDY.tabulate(settings, synthetic_results(settings))
     assert list(results.tables) == ["house-one-store", "homes-one-store", "posterior", "house-envelope",
-                                  "homes-envelope"]
+                                    "homes-envelope"]
     integrated = results.tables["posterior"].loc["integrated out by NUTS"]
     assert integrated["gain in ELL"] == pytest.approx(2.0) and integrated["divergences"] == 2
     assert integrated["means from RAM (sd)"] == pytest.approx(0.2)

@@ -85,7 +85,7 @@ def test_a_chain_that_stands_still_shows():
     two = dataclasses.replace(FEW, datasets=2)
     results = synthetic_results(two)
     constant_task = next(task.name for task in parameters_report.tasks(two) if task.settings["index"] == 1
-                 and task.settings["sampler"] == "RAM, marginal" and task.settings["link"] == "softplus")
+                         and task.settings["sampler"] == "RAM, marginal" and task.settings["link"] == "softplus")
     for name, value in (("ess", np.nan), ("r_hat", np.nan), ("sd", 0.0)):
         results[constant_task][name][3] = value
     row = tabulate(results, two).tables["agreement"].loc["softplus: RAM, marginal"]

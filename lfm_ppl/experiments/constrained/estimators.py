@@ -334,7 +334,7 @@ def thyroid(task: Task) -> Result:
 
 
 def sample_parameters(posterior: LogPosterior, y: np.ndarray, mode: np.ndarray, seed: int, draws: int,
-          weighted: int) -> tuple[np.ndarray, float]:
+                      weighted: int) -> tuple[np.ndarray, float]:
     """Return draws (draws, P) of the logarithms of parameters from their posterior, and the weights' Pareto index.
 
     Systematic resampling selects them from importance samples about the mode. If the posterior has no curvature at the

@@ -53,7 +53,7 @@ def all_tasks(settings: ConstrainedSettings) -> list[Task]:
     return [Task("/".join(filter(None, [kind, slug(shape), f"{first:04d}"])), settings.seed, {
         "experiment": "constrained", "what": kind, "shape": shape, "first": first, "count": last - first + 1,
         **parameters}) for kind, shape, count, parameters in kinds
-        for first, last in dataset_blocks(count, settings.block)]
+            for first, last in dataset_blocks(count, settings.block)]
 
 
 class ByMethod(TaskKind):

@@ -81,7 +81,7 @@ def all_tasks(settings: GinzburgLandauSettings) -> list[Task]:
     for label, (kernel, _) in parameters.SAMPLERS.items():
         size = dict(zip(LENGTHS, (parameters.CHAINS, *getattr(settings, kernel.lower())), strict=True))
         tasks += factory.dataset_tasks(f"mcmc/{slug(label)}", count, sampler=label, paths=settings.paths, **size,
-                                     **kernels[kernel])
+                                       **kernels[kernel])
     return sort_by_dataset(tasks)
 
 

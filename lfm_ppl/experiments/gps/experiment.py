@@ -153,11 +153,11 @@ def tables(settings: GpsSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
     table = satellite_table(data)
     result = {"pooled": StudyTable.from_rows("Errors after training (m), pooled over satellites, and 95% coverage",
-                                            pooled_rows(data["predict"], table)),
-             "satellites": StudyTable(
+                                             pooled_rows(data["predict"], table)),
+              "satellites": StudyTable(
                  "Each satellite: root mean square errors after training (m)", table,
                  pd.DataFrame({name: table[name].map(text.format) for name, text in _PRINTED.items()})),
-             "magnitudes": StudyTable("", magnitude_table(data))}
+              "magnitudes": StudyTable("", magnitude_table(data))}
     if "ways" in data:
         result["learning"] = StudyTable.from_rows(
             "Ways to learn the magnitudes of the forces: error after training (m)",

@@ -27,7 +27,7 @@ def draw(settings: Any, data: Data) -> dict[str, Figure]:
     predicted, online = data["predict"], data.get("online")
     systems = list(dict.fromkeys(predicted.system.values))
     figures = {"all" if len(systems) == 1 else f"all-{system}":
-             plot_all(predicted.isel(satellite=(predicted.system == system).values)) for system in systems}
+               plot_all(predicted.isel(satellite=(predicted.system == system).values)) for system in systems}
     name = (predicted if online is None else online).satellite.values[0]
     satellite = predicted.sel(satellite=name)
     figures |= {f"errors-{name}": plot_errors(satellite), f"forces-{name}": plot_forces(satellite)}

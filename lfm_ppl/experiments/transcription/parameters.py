@@ -149,7 +149,7 @@ def _weighted(settings: Mapping[str, Any], iterations: int, data: problem.DataSe
                          "draws or no iterations.")
     # Another order than that of the chain would overstate the effective sample size.
     indices = [np.sort(importance.resample(weights, len(weights), chain))
-             for chain, weights in enumerate(smoothed.log_weight)]
+               for chain, weights in enumerate(smoothed.log_weight)]
     return np.stack([draws[:, chain, index] for chain, index in enumerate(indices)], axis=1), smoothed.k
 
 
