@@ -196,7 +196,7 @@ def test_the_rate_of_the_first_window_is_where_the_dense_cost_is_least():
 
     best = minimize_scalar(cost, bounds=(0.5 * rate, 2.0 * rate), method="bounded", options={"xatol": 1e-6})
     assert rate == pytest.approx(best.x, rel=0.02) and cost(rate) == pytest.approx(best.fun, abs=1e-4)
-    costs = estimators._costs("window")(np.log(np.sqrt(3.0) / np.array([rate])), y)
+    costs = estimators._compile_costs("window")(np.log(np.sqrt(3.0) / np.array([rate])), y)
     assert float(costs[0]) == pytest.approx(cost(rate), abs=1e-5)
 
 

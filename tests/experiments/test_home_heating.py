@@ -68,7 +68,7 @@ def test_without_data_there_are_simulated_homes_only(tmp_path, monkeypatch):
 def test_a_window_without_set_points_cannot_be_predicted_under_a_thermostat():
     window = problem.Window(np.zeros((120, 3)), {})
     with pytest.raises(ValueError, match="needs a set point"):
-        prediction.thermostat_ahead(Model("SQM", "one store", 3), window, np.zeros(6), 10, jax.random.key(0))
+        prediction.predict_under_thermostat(Model("SQM", "one store", 3), window, np.zeros(6), 10, jax.random.key(0))
 
 
 def test_mask_of_the_fifth_day():
@@ -94,7 +94,7 @@ def test_gaussian_scores_against_scipy():
 def test_the_most_likely_parameters(window):
     """No residual: the search ends where nothing near is better."""
     model = Model("none", "one store", 3)
-    z, density = prediction.most_likely(model, window)
+    z, density = prediction.find_mode(model, window)
     objective = prediction._log_posterior(model).objective(window.learnt)
     value, gradient = objective.value_and_gradient(z)
     assert density == pytest.approx(-value)
@@ -107,10 +107,10 @@ def test_the_most_likely_parameters(window):
 @pytest.mark.slow
 def test_both_predictions(window):
     model = Model("none", "one store", 3)
-    z, _ = prediction.most_likely(model, window)
-    tracked = prediction.known_heater(model, window, z)
+    z, _ = prediction.find_mode(model, window)
+    tracked = prediction.predict_with_known_heater(model, window, z)
     assert tracked["ahead_rmse"] < 1.5 and tracked["mean"].shape == (24,)
-    result, forecast = prediction.thermostat_ahead(model, window, z, 200, jax.random.key(0))
+    result, forecast = prediction.predict_under_thermostat(model, window, z, 200, jax.random.key(0))
     assert result["rmse"] < 1.5 and result["mean"].shape == result["on"].shape == (144,)
     truth = window.fine[prediction.SCORED, 0]
     density = forecast.observed.log_density(window.fine[:, :2])[prediction.SCORED, 0]
@@ -209,7 +209,7 @@ def test_quick_version_resumes(tmp_path):
 @pytest.mark.slow
 def test_nuts_and_ram_have_the_same_posterior(window):
     model = Model("none", "one store", 3)
-    z, _ = prediction.most_likely(model, window)
+    z, _ = prediction.find_mode(model, window)
     nuts = prediction.posterior("NUTS", model, window, z, jax.random.key(0), (2, 300, 700))
     ram = prediction.posterior("RAM", model, window, z, jax.random.key(1), (4, 1000, 4000))
     assert nuts["divergences"] == 0 and max(nuts["r_hat"].max(), ram["r_hat"].max()) < 1.03

@@ -38,7 +38,7 @@ def test_the_likelihood_at_the_truth_is_that_of_the_known_system():
 
 def test_true_values_stand_in_the_order_of_the_names():
     data = problem.data_set(SOFTPLUS, 4)
-    named = dict(zip(parameters.NAMES, parameters.true_values(data), strict=True))
+    named = dict(zip(parameters.NAMES, parameters.true_parameters(data), strict=True))
     for site, value in sites(data).items():
         for gene in range(problem.GENES):
             name = site if np.ndim(value) == 0 else f"{site}[{gene + 1}]"
@@ -134,7 +134,7 @@ def test_on_a_linear_link_marginal_and_latent_posteriors_are_the_same():
 @pytest.mark.slow
 def test_draws_are_taken_as_often_as_the_iterated_likelihood_says():
     data = problem.data_set(SOFTPLUS, 4)
-    truth = parameters.true_values(data)
+    truth = parameters.true_parameters(data)
     draws = truth[:, None, None] * np.random.default_rng(0).uniform(0.8, 1.2, (len(truth), 2, 20))
 
     def log_likelihood(theta, iterations):
@@ -148,7 +148,7 @@ def test_draws_are_taken_as_often_as_the_iterated_likelihood_says():
     ratio = jax.vmap(lambda theta: log_likelihood(theta, 2) - log_likelihood(theta, 0))(flat)
     smoothed, k = arviz_data.psis(np.asarray(ratio))
     weight = np.exp(smoothed).reshape(2, 20)
-    resampled, found_k = parameters._weighted({"link": "softplus", "gamma": None}, 2, data, draws)
+    resampled, found_k = parameters._resample_draws({"link": "softplus", "gamma": None}, 2, data, draws)
     assert resampled.shape == draws.shape and found_k == pytest.approx(k)
     for chain, weights in enumerate(weight / weight.sum(axis=1, keepdims=True)):
         counts = [(resampled[0, chain] == value).sum() for value in draws[0, chain]]

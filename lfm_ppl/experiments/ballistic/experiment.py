@@ -179,11 +179,11 @@ KINDS = {
     "particles": TaskKind(states.run_particles, {
         "dataset path": "filter_rmse, smoother_rmse, smoother_coverage", "dataset path time": "mean, sd",
         "dataset": "log_likelihood, filter_seconds, smoother_seconds", "dataset time": "distinct"}, ("particles",)),
-    **{kind: TaskKind(partial(parameters.estimate_all, from_prior=kind == "drawn"), {
+    **{kind: TaskKind(partial(parameters.estimate_targets, from_prior=kind == "drawn"), {
         "dataset parameter": "likely, posterior_mean, posterior_sd, below", "dataset": "exists, k, ess, seconds",
         "dataset path": "likely_rmse, likely_coverage, posterior_rmse, posterior_coverage", "parameter draw": "draws"})
        for kind in ("parameters", "drawn")},
-    "known": TaskKind(parameters.rank_all, {"dataset": "below"}),
+    "known": TaskKind(parameters.rank_targets, {"dataset": "below"}),
     "chains": TaskKind(parameters.sample_chains, {
         "dataset parameter": "mean, sd, ess, r_hat", "dataset": "seconds, divergences",
         "dataset parameter chain draw": "draws"}, ("sampler",)),

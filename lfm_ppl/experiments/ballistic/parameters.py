@@ -44,7 +44,7 @@ MAX_DISTANCE = 3.0
 further away has no maximum among plausible values."""
 
 
-def estimate_all(task: Task, from_prior: bool = False) -> Result:
+def estimate_targets(task: Task, from_prior: bool = False) -> Result:
     """Return the entries of `estimate` for every target of a task, and ``draws`` of the first.
 
     The targets have the true parameters or, with ``from_prior``, parameters drawn from the prior.
@@ -108,7 +108,7 @@ def sample_chains(task: Task) -> Result:
     return chains.sample(mcmc, problem.NAMES, task.key, target.times, target.y)
 
 
-def rank_all(task: Task) -> Result:
+def rank_targets(task: Task) -> Result:
     """Return ``below`` (N,), the entries of `rank_drag` for the targets of a task."""
     targets = (problem.simulate_target(index, task.seed) for index in dataset_indices(task))
     return {"below": np.array([rank_drag(target) for target in targets])}

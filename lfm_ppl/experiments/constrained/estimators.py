@@ -72,10 +72,11 @@ def shortest_band(posterior: ConstrainedPosterior, name: str) -> tuple[jax.Array
     A central interval never contains a truth at the bound.
     """
     low = [jnp.zeros_like(posterior.times), *(posterior.interval(name, 1.0 - 2.0 * share)[0] for share in _BELOW[1:])]
-    return _narrowest(jnp.stack(low), jnp.stack([posterior.interval(name, 0.9 + 2.0 * share)[1] for share in _BELOW]))
+    high = [posterior.interval(name, 0.9 + 2.0 * share)[1] for share in _BELOW]
+    return _narrowest_band(jnp.stack(low), jnp.stack(high))
 
 
-def _narrowest(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _narrowest_band(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the bounds (K,) of the narrowest of several bands (S, K)."""
     best = jnp.argmin(high - low, axis=0)[None]
     return jnp.take_along_axis(low, best, 0)[0], jnp.take_along_axis(high, best, 0)[0]
@@ -85,22 +86,22 @@ def _narrowest(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
 # each. The bounds are NaN for estimators without a band, and infinite if the estimate has not converged.
 
 
-def _smoother(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+def _estimate_by_smoother(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     force = smooth(problem.transcription(*values), TIMES, y).force(FACTOR)
     return force.mean, force.mean - Z * force.sd, force.mean + Z * force.sd
 
 
-def _link(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+def _estimate_with_link(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     """Return the mean of softplus(u) by quadrature, and its shortest 95% interval."""
     model = problem.transcription(*values, softplus=True)
     force = smooth(model, TIMES, y, rule=GaussHermite(5), steps=1).force(FACTOR)
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     mean = (weights / weights.sum() * jax.nn.softplus(force.mean[:, None] + force.sd[:, None] * nodes)).sum(axis=1)
     below, above = (norm.ppf(jnp.asarray(shares))[:, None] for shares in (_BELOW, _BELOW + 0.95))
-    return mean, *_narrowest(*(jax.nn.softplus(force.mean + force.sd * z) for z in (below, above)))
+    return mean, *_narrowest_band(*(jax.nn.softplus(force.mean + force.sd * z) for z in (below, above)))
 
 
-def _bands(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+def _estimate_by_ep(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     """Return EP estimates on every tenth row; a prior truncated on more rows moves the force away from its bound."""
     rows = TIMES[:: METHODS[BANDS].every]
     posterior = constrained_posterior(problem.transcription(*values), TIMES, y, lower={FACTOR: 0.0}, grid=rows)
@@ -113,24 +114,24 @@ def _without_band(estimate: jax.Array, converged: Any = True) -> tuple[jax.Array
     return estimate, bound, bound
 
 
-def _full(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+def _estimate_by_full_information(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     estimate = full_information(problem.transcription(*values), TIMES, y, lower={FACTOR: 0.0}, grid=TIMES)
     return _without_band(estimate.force(FACTOR), estimate.converged)
 
 
-def _cost(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
-    estimate = _minimum(values, jnp.zeros(3), y)
+def _estimate_by_cost(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+    estimate = _minimise_cost(values, jnp.zeros(3), y)
     return _without_band(estimate.state(FACTOR), estimate.converged)
 
 
-def _minimum(values: jax.Array, mean: Any, y: jax.Array) -> ConstrainedEstimate:
+def _minimise_cost(values: jax.Array, mean: Any, y: jax.Array) -> ConstrainedEstimate:
     """Minimise the source's cost of samples given an arrival mean and the lengthscales (P,) of force and weights."""
     times = TIMES[: len(y)]
     return full_information(problem.companion(values[0], mean, values[-1]), times, y, lower={FACTOR: 0.0}, grid=times,
                             tolerance=1e-8)
 
 
-def _horizon(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+def _estimate_by_horizon(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     return _without_band(horizon(values, y)[:, 1])
 
 
@@ -144,7 +145,7 @@ def horizon(values: jax.Array, y: jax.Array) -> jax.Array:
     half, last = WINDOW // 2, len(TIMES) - 1 - WINDOW
 
     def window(begin: Any, mean: jax.Array) -> jax.Array:
-        return _minimum(values, mean, jax.lax.dynamic_slice_in_dim(y, begin, WINDOW + 1)).state_mean
+        return _minimise_cost(values, mean, jax.lax.dynamic_slice_in_dim(y, begin, WINDOW + 1)).state_mean
 
     def step(estimate: jax.Array, begin: jax.Array) -> tuple[jax.Array, None]:
         return estimate.at[begin + half].set(window(begin, estimate[begin])[half]), None
@@ -172,12 +173,14 @@ class Method(NamedTuple):
 
 HORIZON, SMOOTHER, FULL, BANDS = "delayed MHE, 60 samples", "smoother", "full information", "EP"
 METHODS = {
-    "smoother, 60 samples": Method(_smoother, "early", published=problem.PUBLISHED["smoother"]),
-    HORIZON: Method(_horizon, "early", published=problem.PUBLISHED["delayed MHE"]),
-    "delayed MHE, rate a state": Method(_horizon, "window", published=problem.PUBLISHED["delayed MHE"]),
-    "full information, rate a state": Method(_cost, "record"), "full information, rate in Q": Method(_cost, "weight"),
-    SMOOTHER: Method(_smoother, "all"), FULL: Method(_full, "all"), BANDS: Method(_bands, "all", every=10),
-    "softplus link": Method(_link, "softplus")}
+    "smoother, 60 samples": Method(_estimate_by_smoother, "early", published=problem.PUBLISHED["smoother"]),
+    HORIZON: Method(_estimate_by_horizon, "early", published=problem.PUBLISHED["delayed MHE"]),
+    "delayed MHE, rate a state": Method(_estimate_by_horizon, "window", published=problem.PUBLISHED["delayed MHE"]),
+    "full information, rate a state": Method(_estimate_by_cost, "record"),
+    "full information, rate in Q": Method(_estimate_by_cost, "weight"),
+    SMOOTHER: Method(_estimate_by_smoother, "all"), FULL: Method(_estimate_by_full_information, "all"),
+    BANDS: Method(_estimate_by_ep, "all", every=10),
+    "softplus link": Method(_estimate_with_link, "softplus")}
 
 
 def transcription(task: Task) -> Result:
@@ -235,7 +238,7 @@ def learn_rate_as_state(kind: str, y: np.ndarray) -> np.ndarray:
     have the same minimum for a constant Q, and reach it on short records. On full records the cost hardly depends on
     the rate, and they take hundreds of passes.
     """
-    costs, grid, lengthscales = _costs(kind), np.log(_LENGTHSCALES), []
+    costs, grid, lengthscales = _compile_costs(kind), np.log(_LENGTHSCALES), []
     for record in y:
         best = int(np.argmin(costs(grid, record)))
         bounds = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
@@ -247,14 +250,14 @@ def learn_rate_as_state(kind: str, y: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
-def _costs(kind: str) -> Callable[[Any, Any], jax.Array]:
+def _compile_costs(kind: str) -> Callable[[Any, Any], jax.Array]:
     """Return a function from log lengthscales (G,) and a record to least costs (G,), with the rate's arrival cost."""
     count = WINDOW + 1 if kind == "window" else len(TIMES)
 
     def cost(z: jax.Array, y: jax.Array) -> jax.Array:
         weight_lengthscale = jnp.exp(z) if kind == "weight" else jnp.asarray(problem.INITIAL_LENGTHSCALE)
         arrival = problem.ARRIVAL * 3.0 * (jnp.exp(-z) - 1.0 / problem.INITIAL_LENGTHSCALE) ** 2
-        return _minimum(jnp.stack([jnp.exp(z), weight_lengthscale]), jnp.zeros(3), y[:count]).objective + arrival
+        return _minimise_cost(jnp.stack([jnp.exp(z), weight_lengthscale]), jnp.zeros(3), y[:count]).objective + arrival
 
     return jax.jit(jax.vmap(cost, in_axes=(0, None)))
 
@@ -262,7 +265,7 @@ def _costs(kind: str) -> Callable[[Any, Any], jax.Array]:
 # --- a target on reentry, and patients
 
 
-def _target(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _estimate_target(y: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return paths (3, T) given distances (T, 1), and whether the estimate has converged."""
     # The arrival cost is 2 |x - guess|^2_P with P = 1e-11 I, next to |y - h|^2_R.
     estimate = full_information(problem.ballistic(problem.INITIAL_GUESS, 1.0 / 2e-11), problem.TARGET_TIMES, y,
@@ -273,11 +276,11 @@ def _target(y: jax.Array) -> tuple[jax.Array, jax.Array]:
 def ballistic(task: Task) -> Result:
     """Return ``rmse`` (N, 3) and ``converged`` (N,), and the first target's ``estimate`` and ``truth`` (3, T)."""
     y, truth = map(np.stack, zip(*(problem.target(index, task.seed) for index in dataset_indices(task)), strict=True))
-    paths, converged = map(np.asarray, _compile(_target)(y))
+    paths, converged = map(np.asarray, _compile(_estimate_target)(y))
     return {"rmse": rmse(paths, truth), "converged": converged, "estimate": paths[0], "truth": truth[0]}
 
 
-def _patient(z: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
+def _estimate_patient(z: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
     """Return the full information estimate given logarithms of parameters (P,) and concentrations (T, 3)."""
     posterior = problem.thyroid_learning()
     model = posterior.likelihood(z, y).model
@@ -287,7 +290,7 @@ def _patient(z: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
             "lowest": jnp.minimum(estimate.state_mean.min(), estimate.force_mean.min())}
 
 
-def _patient_bands(draws: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
+def _estimate_patient_bands(draws: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
     """Return mean and band of the mixture over draws (D, P) of the logarithms of parameters."""
     posterior = problem.thyroid_learning()
 
@@ -320,7 +323,7 @@ def thyroid(task: Task) -> Result:
     samples = [sample_parameters(posterior, *inputs, *counts) for inputs in zip(y, z, seeds, strict=True)]
     draws, k = map(np.stack, zip(*samples, strict=True))
     estimates = {name: np.asarray(value) for name, value in
-                 (_compile(_patient)(z, y) | _compile(_patient_bands)(draws, y)).items()}
+                 (_compile(_estimate_patient)(z, y) | _compile(_estimate_patient_bands)(draws, y)).items()}
     times = estimates.pop("times")[0]
     truth = np.stack([np.interp(times, patient.truth["times"], patient.truth["forces"][HORMONE])
                       for patient in patients])
@@ -367,7 +370,7 @@ def shortest_interval(values: jax.Array, bound: float = -math.inf, level: float 
     parts = math.ceil(level * len(values))
     # The bound lies half a part below the first quantile, so that its interval ends half a part earlier.
     low = jnp.concatenate([jnp.full_like(ordered[:1], bound), ordered[: len(values) - parts]])
-    return _narrowest(low, jnp.concatenate([0.5 * (ordered[parts - 1] + ordered[parts])[None], ordered[parts:]]))
+    return _narrowest_band(low, jnp.concatenate([0.5 * (ordered[parts - 1] + ordered[parts])[None], ordered[parts:]]))
 
 
 def peak_time(times: np.ndarray, paths: np.ndarray) -> np.ndarray:

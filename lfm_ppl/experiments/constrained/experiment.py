@@ -80,7 +80,7 @@ def tables(settings: ConstrainedSettings, data: Data) -> dict[str, StudyTable]:
                 rows(dataset, "method", ERRORS)),
             "shapes": StudyTable.from_rows(
                 "By the shape of the force",
-                {method: by_shape(dataset.sel({"method": method})) for method in settings.methods}),
+                {method: shape_row(dataset.sel({"method": method})) for method in settings.methods}),
             "others": StudyTable.from_rows(
                 f"{settings.targets} targets on reentry and {settings.patients} patients", other_rows(data))}
 
@@ -101,7 +101,7 @@ of one realisation; the share of records with a larger error than the published 
 estimate, which the other columns leave out."""
 
 
-def by_shape(dataset: xr.Dataset) -> dict[str, Any]:
+def shape_row(dataset: xr.Dataset) -> dict[str, Any]:
     """Return median MSE and coverage of an estimator for each shape of the force."""
     columns: dict[str, Column] = {"median MSE, {shape}": lambda records: records.mse.median(skipna=False),
                                   "coverage, {shape}": "coverage"}

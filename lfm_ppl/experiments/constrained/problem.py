@@ -68,7 +68,7 @@ def record(shape: str, index: int, seed: int = 0) -> TranscriptionRecord:
     """Return record ``index`` of a shape."""
     random = np.random.default_rng((seed, index, SHAPES.index(shape)))
     fine = np.linspace(0.0, TIMES[-1], _FINE * (len(TIMES) - 1) + 1)
-    force = _force(shape, fine, random)
+    force = _draw_force(shape, fine, random)
     step = fine[1]
     production = (SENSITIVITY * force + PROCESS_SD * random.normal(size=len(fine)) / np.sqrt(step))[:-1]
     gain = -np.expm1(-DECAY * step) / DECAY
@@ -76,7 +76,7 @@ def record(shape: str, index: int, seed: int = 0) -> TranscriptionRecord:
     return TranscriptionRecord((state + NOISE_SD * random.normal(size=len(TIMES)))[:, None], force[::_FINE])
 
 
-def _force(shape: str, t: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def _draw_force(shape: str, t: np.ndarray, random: np.random.Generator) -> np.ndarray:
     if shape == "pulses":
         centre, width = random.uniform(0.0, TIMES[-1], (6, 1)), random.uniform(0.4, 0.8, (6, 1))
         return (random.uniform(0.5, 1.5, (6, 1)) * np.exp(-0.5 * ((t - centre) / width) ** 2)).sum(axis=0)

@@ -99,7 +99,7 @@ def _compile_likelihoods(method: str, size: int, steps: int, times: tuple[float,
         ssm = state_space(system)
         time_grid = build_time_grid(ssm, np.array(times), steps)
         if method == problem.GRID:
-            return grid_filter.log_likelihood(ssm, time_grid, y, states.cells_of(size))
+            return grid_filter.log_likelihood(ssm, time_grid, y, states.build_grid(size))
         settings = particle_filter.check_settings(ssm, particle_filter.ParticleSettings(size))
         return particle_filter.log_likelihood(ssm, time_grid, y, key, settings)
 
@@ -170,7 +170,7 @@ def sample_posterior(task: Task) -> Result:
     draws = np.asarray(draws)
     mean, variance = map(np.asarray, _smooth_at_draws(
         scores.thin_draws(draws, settings["paths"]), data.sparse, SAMPLERS[settings["sampler"]][1],
-        states.size_of(settings, data), tuple(data.fine)))
+        states.solver_size(settings, data), tuple(data.fine)))
     paths = states.band("smoother", *scores.total_moments(mean, variance))
     return {"draws": draws, "divergences": int(divergences), "seconds": seconds,
             **scores.diagnose(problem.NAMES, draws), **paths, **states.score_path("smoother", paths, data.path)}

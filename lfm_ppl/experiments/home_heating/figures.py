@@ -43,7 +43,7 @@ def plot_homes(settings: Any, data: Data, *, store: str | None = None, width: st
     assert window.fine is not None and window.set_points is not None
     hours, set_points = problem.FINE[prediction.SCORED] - problem.TRAIN, window.set_points[problem.TRAIN:]
     truth, _, heater = window.fine[prediction.SCORED].T
-    figure, panels = _panels(width, data["homes"].sel(store=store).isel(dataset=0), "heater on")
+    figure, panels = _build_panels(width, data["homes"].sel(store=store).isel(dataset=0), "heater on")
     for residual, upper, lower in panels:
         low, quarter, middle, upper_quarter, high = residual.quantiles
         upper.plot(hours, middle, color=style.BLUE, label="predicted")
@@ -66,7 +66,7 @@ def plot_house(settings: Any, data: Data, *, store: str | None = None, width: st
     index = house.sizes["dataset"] // 2
     temperature, _, power = problem.house(settings.data)[index].y[problem.TRAIN:].T
     house = house.isel(dataset=index)
-    figure, panels = _panels(width, house.assign(select_prefix(house, "ahead")), "power")
+    figure, panels = _build_panels(width, house.assign(select_prefix(house, "ahead")), "power")
     for residual, upper, lower in panels:
         upper.plot(hours, residual["mean"], color=style.BLUE, label="predicted")
         band(upper, hours, residual["mean"], residual["sd"], color=_WIDE)
@@ -78,8 +78,8 @@ def plot_house(settings: Any, data: Data, *, store: str | None = None, width: st
     return figure
 
 
-def _panels(width: str | float, dataset: xr.Dataset,
-            heating: str) -> tuple[Figure, list[tuple[xr.Dataset, Axes, Axes]]]:
+def _build_panels(width: str | float, dataset: xr.Dataset,
+                  heating: str) -> tuple[Figure, list[tuple[xr.Dataset, Axes, Axes]]]:
     """Return a figure, and for each residual in it the results and the axes of temperature and heating."""
     methods = [method for method in _FIGURE_METHODS if method in dataset.method] or list(dataset.method.values)
     columns = min(3, len(methods))
