@@ -203,7 +203,7 @@ def _compile_chains(label: str, lengths: tuple[int, ...], steps: Any, particles:
         # One loop for warm-up and draws, which the kernel distinguishes, compiles the likelihood only once.
         start = kernel.init(key, warmup * thin, None, arguments, {})
         _, records = jax.lax.scan(step, start, length=warmup + draws)
-        z, diverging = jax.tree_util.tree_map(lambda a: a[warmup:], records)
+        z, diverging = jax.tree.map(lambda a: a[warmup:], records)
         sites = jax.vmap(kernel.postprocess_fn(arguments, {}))(z)
         return jnp.stack([sites[name] for name in problem.NAMES]), diverging.sum()
 

@@ -32,10 +32,10 @@ BLOCK = 10
 """Data sets of one task; a run with more data sets reuses all complete blocks."""
 
 TRUST = (
-    "Where elliptical slice sampling is lower than published it is trusted: it has the exact posterior of a linear "
-    "link and agrees with blackjax's independent elliptical slice sampler on five data sets (both are tests), and "
-    "chains whose R-hat is above 1.01 go on, up to five times as long (`mixed` and `ESS` say how that ended). This "
-    "says nothing of LA and GFS, which draw nothing.")
+    "Errors of elliptical slice sampling below the published ones are trusted: it samples the exact posterior of a "
+    "linear link and agrees with blackjax's independent elliptical slice sampler on five data sets (both are tests), "
+    "and chains with an R-hat above 1.01 continue, up to five times as long (see `mixed` and `ESS`). LA and GFS do not "
+    "sample, so that these reasons do not apply to them.")
 """Evidence that lower errors than published are correct."""
 
 _LABELS = tuple(entry.label for entry in problem.CONFIGURATIONS)
