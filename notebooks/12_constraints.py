@@ -97,7 +97,7 @@ states = lfm.full_information(problem.companion(1.0, np.zeros(3), learnt=True), 
 learning = problem.learning("all")
 likeliest = estimators.posterior_mode(learning, record.y)
 pd.Series({"a state, Q constant": float(np.sqrt(3.0) / states.state("rate")[0]),
-           "a state, Q with it": estimators.states("weight", record.y[None])[0, 0],
+           "a state, Q with it": estimators.learn_rate_as_state("weight", record.y[None])[0, 0],
            "marginal likelihood": np.exp(likeliest[0])}, name="lengthscale (s)").round(2)
 
 # %% [markdown]

@@ -319,7 +319,7 @@ BOUNDS = {
     "iterations": Case("fit model.py --lower x0=-3 --iterations 2", ("Leave iterations out",)),
     "a tolerance": Case("fit model.py --lower x0=-3 --tolerance 0.1", ("tolerance is not supported", "raise steps")),
     "particles": Case("fit model.py --lower x0=-3 --sampler pmmh", ("--lower and --upper are for the samplers",)),
-    "rows of nothing": Case("fit model.py --grid 20", ("--grid is the number of times at which --lower and --upper hold",)),
+    "rows of nothing": Case("fit model.py --grid 20", ("--grid is the number of times",)),
     **{f"rows: {value}": Case(f"fit model.py --lower x0=-3 --grid {value}", (
         "--grid: expected a whole number of at least 2", repr(value))) for value in ("1", "0", "2.5", "many", "1e3")},
     "many fits": Case("fit model.py --each --data d.csv --grid 20", ("--grid is the number of times",),

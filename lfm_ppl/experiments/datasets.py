@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.experiments.scores import Estimate, estimate_cells, mean_of, rate_of
+from lfm_ppl.experiments.scores import Estimate, estimate_cells, estimate_mean, estimate_rate
 from lfm_ppl.parallel.task import Result, Task
 
 DATASET = "dataset"
@@ -161,7 +161,7 @@ def _split(dataset: xr.Dataset, name: str) -> list[xr.Dataset]:
 def cell(name: str, value: Any) -> dict[str, Any]:
     """Return the cells for a value: values of all data sets, an estimate, a number or text."""
     if isinstance(value, xr.DataArray) and DATASET in value.dims:
-        value = (rate_of if value.dtype == bool else mean_of)(value.values)
+        value = (estimate_rate if value.dtype == bool else estimate_mean)(value.values)
     if isinstance(value, Estimate):
         return estimate_cells(name, value)
     return {name: value if isinstance(value, str | int) else float(value)}

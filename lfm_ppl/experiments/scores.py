@@ -75,11 +75,11 @@ def readable(frame: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(columns, index=frame.index)
 
 
-def mean_of(values: Any) -> Estimate:
+def estimate_mean(values: Any) -> Estimate:
     """Return the mean of independent numbers with its standard error, without NaN entries.
 
     Example:
-        >>> str(mean_of([1.0, 2.0, 3.0]))
+        >>> str(estimate_mean([1.0, 2.0, 3.0]))
         '2.00 (0.58)'
     """
     finite = np.asarray(values, float).ravel()
@@ -90,19 +90,19 @@ def mean_of(values: Any) -> Estimate:
     return Estimate(float(finite.mean()), float(error))
 
 
-def sd_of(values: Any) -> float:
+def sample_sd(values: Any) -> float:
     """Return the sample standard deviation of independent numbers; NaN for a single number."""
     sample = np.asarray(values, float)  # xarray's std would skip NaN
     return float(sample.std(ddof=1)) if sample.size > 1 else np.nan
 
 
-def rate_of(hits: Any) -> Estimate:
+def estimate_rate(hits: Any) -> Estimate:
     """Return the share of True among independent outcomes with its binomial standard error sqrt(p (1 - p) / n).
 
     Where all outcomes are equal, the error uses p = (k + 1) / (n + 2): k = 0 of n does not prove that p = 0.
 
     Example:
-        >>> str(rate_of([True] * 20 + [False] * 80))
+        >>> str(estimate_rate([True] * 20 + [False] * 80))
         '0.200 (0.040)'
     """
     outcomes = np.asarray(hits, bool).ravel()
@@ -122,7 +122,7 @@ def paired_ratio(first: Any, second: Any) -> Estimate:
     """
     first, second = np.asarray(first, float), np.asarray(second, float)
     ratio = first.mean() / second.mean()
-    return Estimate(float(ratio), mean_of(first - ratio * second).error / float(second.mean()))
+    return Estimate(float(ratio), estimate_mean(first - ratio * second).error / float(second.mean()))
 
 
 def rmse(estimate: Any, truth: Any) -> Any:
@@ -254,7 +254,7 @@ class GridPosterior:
         """Return the quantile of probability ``p``."""
         return np.interp(p, self.distribution, self.x)
 
-    def below(self, value: float) -> float:
+    def cdf(self, value: float) -> float:
         """Return the posterior probability of a value below ``value``."""
         return float(np.interp(value, self.x, self.distribution))
 

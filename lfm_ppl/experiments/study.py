@@ -191,7 +191,7 @@ class StudySettings:
     """Settings of any study; a study subclasses this and adds its fields."""
 
     seed: int = dataclasses.field(default=0, kw_only=True, metadata={
-        "declaration": SettingDeclaration("of everything random", metavar="N", least=0)})
+        "declaration": SettingDeclaration("seed of all random numbers", metavar="N", least=0)})
 
     def __post_init__(self) -> None:
         """Check every setting separately; a subclass adds checks that involve several settings."""

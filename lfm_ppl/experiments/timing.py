@@ -16,7 +16,7 @@ def time_call(run: Callable, *arguments: Any) -> tuple[float, Any]:
     """
     start = time.process_time()
     value = run(*arguments)
-    jax.block_until_ready(jax.tree_util.tree_leaves(value))
+    jax.block_until_ready(jax.tree.leaves(value))
     return time.process_time() - start, value
 
 

@@ -6,11 +6,11 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
-from tests.cli.test_check import WELL
 
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.results import arviz_data
+from tests.cli.test_check import WELL
 
 
 def run(line, capsys=None):

@@ -1,4 +1,4 @@
-"""Queues of a call centre as an experiment: counts, the queue that they make, scores, tables and figures."""
+"""Call centre study: counts, queues, scores, tables and figures."""
 
 import dataclasses
 import os
@@ -9,15 +9,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from scipy import integrate, special, stats
+from scipy import integrate, stats
 
-import lfm_ppl as lfm
 from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.call_centre import counts, experiment, figures, learning, problem, tracking
+from lfm_ppl.experiments.call_centre import counts, experiment, figures, problem, tracking
 from lfm_ppl.experiments.study import TASKS
-from lfm_ppl.inference.optimise import End, Objective
 from lfm_ppl.parallel.store import write_result
-from lfm_ppl.results import importance_at_modes
 from lfm_ppl.utils.run_store import RunStore
 
 DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
@@ -28,11 +25,11 @@ def window(index=0, data=None):
     return problem.build_window(data, "Thursday", index)
 
 
-def tasks_of(what, settings):
-    return [task for task in experiment.all_tasks(settings) if task.settings["what"] == what]
+def tasks_of(kind, settings):
+    return [task for task in experiment.all_tasks(settings) if task.settings["what"] == kind]
 
 
-def written(path, change=lambda table: table):
+def write_counts(path, change=lambda table: table):
     """Write two days of counts as a file."""
     times = [pd.Timestamp(day) + pd.Timedelta(minutes=5 * k + 420)
              for day in ("2003-03-06", "2003-03-13") for k in range(169)]
@@ -43,11 +40,11 @@ def written(path, change=lambda table: table):
 
 
 def test_counts_are_read_day_by_day(tmp_path):
-    found = counts.read(written(tmp_path / counts.FILE))
-    assert found.dates.astype(str).tolist() == ["2003-03-06", "2003-03-13"]
-    np.testing.assert_array_equal(found.calls, [np.arange(168), 169 + np.arange(168)])
+    days = counts.read(write_counts(tmp_path / counts.FILE))
+    assert days.dates.astype(str).tolist() == ["2003-03-06", "2003-03-13"]
+    np.testing.assert_array_equal(days.calls, [np.arange(168), 169 + np.arange(168)])
     assert len(counts.read(tmp_path).select_weekday("Thursday").dates) == 2
-    assert len(found.select_weekday("Friday").dates) == 0
+    assert len(days.select_weekday("Friday").dates) == 0
 
 
 def set_cell(row, column, value):
@@ -66,9 +63,9 @@ def set_cell(row, column, value):
     (set_cell(7, "DateTime", "2003-03-05T07:00:00Z"), "row 9.*a later time than before"),
     (lambda table: table.drop(index=20), "2003-03-06 has 167"),
 ])
-def test_counts_that_cannot_be_used(tmp_path, change, message):
+def test_invalid_counts(tmp_path, change, message):
     with pytest.raises(ValueError, match=message):
-        counts.read(written(tmp_path / "calls.csv", change))
+        counts.read(write_counts(tmp_path / "calls.csv", change))
     with pytest.raises(FileNotFoundError, match="there is no file"):
         counts.read(tmp_path / "none")
 
@@ -78,13 +75,13 @@ def test_the_queue_solves_its_equation():
     arrivals = np.random.default_rng(0).uniform(2.0, 14.0, 60)
     service = np.repeat([15.0, 5.0, 4.0], 20)
     with pytest.warns(counts.OverloadWarning, match="more customers come than are served for"):
-        found = counts.queue(arrivals, service)
+        path = counts.queue(arrivals, service)
     expected = [0.0]
     for zeta, omega in zip(arrivals, service, strict=True):
-        one = integrate.solve_ivp(lambda t, x: zeta - omega * x / (1 + x), (0, 5), expected[-1:],  # noqa: B023
-                                  method="DOP853", rtol=1e-11, atol=1e-12)
-        expected.append(one.y[0, -1])
-    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=2e-6)
+        solution = integrate.solve_ivp(lambda t, x: zeta - omega * x / (1 + x), (0, 5), expected[-1:],  # noqa: B023
+                                       method="DOP853", rtol=1e-11, atol=1e-12)
+        expected.append(solution.y[0, -1])
+    np.testing.assert_allclose(path, expected, rtol=1e-7, atol=2e-6)
 
 
 def test_rates_must_not_be_negative():
@@ -97,22 +94,23 @@ def test_rates_must_not_be_negative():
 @real
 def test_real_days_have_the_stated_utilisation():
     everything = counts.read(DATA)
-    own, rate = problem.load_days(str(DATA), "Thursday", 0)
-    assert everything.calls.shape == (164, 168) and len(own.dates) == 34
+    thursdays, rate = problem.load_days(str(DATA), "Thursday", 0)
+    assert everything.calls.shape == (164, 168) and len(thursdays.dates) == 34
     assert rate * everything.calls.mean() == pytest.approx(7.0)
-    assert len(own.dates) - problem.TRAINING_DAYS == 31
+    assert len(thursdays.dates) - problem.TRAINING_DAYS == 31
 
 
 def test_a_window_has_its_readings_where_they_belong():
-    one = window(1)
-    assert one.arrivals.shape == (672,) and one.training.shape == (63, 1)
-    test = one.y["changed"][problem.TEST_START:, 0]
+    call_window = window(1)
+    assert call_window.arrivals.shape == (672,) and call_window.training.shape == (63, 1)
+    test = call_window.y["changed"][problem.TEST_START:, 0]
     np.testing.assert_array_equal(problem.GRID[problem.TEST_START:][np.isfinite(test)], 2520.0 + 180.0 * np.arange(5))
-    np.testing.assert_array_equal(one.y["constant"][:problem.TEST_START], one.y["changed"][:problem.TEST_START])
-    read = np.isfinite(one.y["constant"][:, 0])
-    error = np.expm1(one.y["constant"][read, 0]) - one.queues["constant"][read]
+    constant, changed = (call_window.y[test][:problem.TEST_START] for test in ("constant", "changed"))
+    np.testing.assert_array_equal(constant, changed)
+    read = np.isfinite(call_window.y["constant"][:, 0])
+    error = np.expm1(call_window.y["constant"][read, 0]) - call_window.queues["constant"][read]
     assert 0.3 < np.std(error) < 0.7
-    np.testing.assert_array_equal(window(0).arrivals[168:], one.arrivals[:504])  # a window later is a week later
+    np.testing.assert_array_equal(window(0).arrivals[168:], call_window.arrivals[:504])  # windows move by one week
 
 
 @real
@@ -120,10 +118,10 @@ def test_the_bound_on_settling_matters_little():
     """Real queues with the bounded rate of the model, against the equation itself: below the error of readings."""
     fastest = sys.modules[problem.model_file().model.__module__].FASTEST
     for index in (0, 10):
-        one = window(index, str(DATA))
+        call_window = window(index, str(DATA))
         for name, tested in problem.TEST_RATES.items():
             x, path, h = 0.0, [0.0], 0.25
-            for zeta, omega in zip(one.arrivals, problem.service_rates(tested), strict=True):
+            for zeta, omega in zip(call_window.arrivals, problem.service_rates(tested), strict=True):
                 for _ in range(20):
                     def slope(x, zeta=zeta, omega=omega):
                         free = np.exp(-x)
@@ -134,107 +132,22 @@ def test_the_bound_on_settling_matters_little():
                     k3 = slope(x + 0.5 * h * k2)
                     x += h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(x + h * k3))
                 path.append(x)
-            off = np.abs(np.expm1(path) - one.queues[name])[2:]
+            off = np.abs(np.expm1(path) - call_window.queues[name])[2:]
             # Most of all where arrivals jump from one count to the next.
-            share = off / (1.0 + one.queues[name][2:])
+            share = off / (1.0 + call_window.queues[name][2:])
             assert np.median(share) < 0.007 and np.max(share) < 0.14
             assert name == "changed" or np.sqrt(np.mean(off**2)) < 0.4 * problem.NOISE
 
 
-@pytest.mark.slow
-def test_the_densities_are_those_of_the_model():
-    """The prior against scipy's, the likelihood against that of the model built by hand."""
-    method, one = problem.ArrivalModel("matern"), window()
-    assert method.names == ("mean", "scale", "lengthscale", "noise_sd")
-    z = np.log([6.5, 2.0, 100.0, 0.6])
-    log_likelihood, log_prior = problem.posterior(method).log_densities(z, one.training)
-    medians, spread = np.log([6.0, 2.0, 168.0, 0.5]), np.array([0.5, 0.7, 0.7, 0.7])
-    assert log_prior == pytest.approx(stats.norm(medians, spread).logpdf(z).sum(), rel=1e-9)
-    m = sys.modules[problem.model_file().model.__module__]
-    system = m.build(6.5, 2.0, 0.6, 100.0, force="matern", service=problem.SERVICE_RATE)
-    given = lfm.MarginalLikelihood(system, problem.TRAINING_TIMES, steps=m.STEPS)
-    assert log_likelihood == pytest.approx(float(given.log_prob(one.training)), rel=1e-9)
-
-
-@pytest.mark.slow
-def test_the_gradient_is_that_of_finite_differences():
-    method, one = problem.ArrivalModel("matern"), window()
-    objective = problem.posterior(method).objective(one.training)
-    z = np.log([6.5, 2.0, 150.0, 0.8])
-    _, gradient = objective.value_and_gradient(z)
-    steps = 1e-5 * np.eye(4)
-    expected = [(objective.value(z + step) - objective.value(z - step)) / 2e-5 for step in steps]
-    np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-5)
-    (best, *_), _ = learning.run_searches(method, one.training)
-    assert best.value < problem.posterior(method).objective(one.training, 0.0).value(z)
-
-
-def searched(monkeypatch, value_and_gradient):
-    """Let searches be of ``value_and_gradient(z, prior)``, in the place of the posterior."""
-
-    class Posterior:
-        def objective(self, y, prior=1.0):
-            return Objective(lambda z: value_and_gradient(np.asarray(z), prior))
-
-    monkeypatch.setattr(problem, "posterior", lambda method: Posterior())
-
-
-@pytest.mark.slow
-def test_searches_from_several_starts_find_several_modes(monkeypatch):
-    """Three wells, one of them far higher than the others."""
-    method = problem.ArrivalModel("sqm")
-    starts = np.log([[start[name] for name in method.names] for start in learning.STARTS])
-    wells, depth, evaluated = starts + 0.05, np.array([3.0, -2.0, 30.0]), []
-
-    def value_and_gradient(z, prior):
-        k = np.argmin(((z - wells) ** 2).sum(axis=1))
-        evaluated.append(k)
-        return 20 * ((z - wells[k]) ** 2).sum() + depth[k] + prior, 40 * (z - wells[k])
-
-    searched(monkeypatch, value_and_gradient)
-    found = learning.find_modes(method, np.zeros((63, 1)))
-    np.testing.assert_allclose([mode.point for mode in found], wells[[1, 0]], atol=1e-4)
-    assert [-mode.value for mode in found] == pytest.approx([1.0, -4.0])
-    evaluated.clear()
-    (best, *_), evaluations = learning.run_searches(method, np.zeros((63, 1)))
-    np.testing.assert_array_equal(best.point, found[0].point)
-    assert -best.value == pytest.approx(2.0)
-    assert set(evaluated) == {0, 1, 2} and evaluations == len(evaluated)
-    depth[:], wells[:] = 0.0, wells[0]
-    assert len(learning.find_modes(method, np.zeros((63, 1)))) == 1
-    searched(monkeypatch, lambda z, prior: (np.inf, np.zeros(len(method.names))))
-    with pytest.raises(ValueError, match="not finite at any start of the searches for sqm"):
-        learning.run_searches(method, np.zeros((63, 1)))
-
-
-def test_a_lower_mode_without_curvature_is_none(monkeypatch):
-    """The second of three lies on a saddle; where the gradient about the third is not a number, it is left out, too."""
-    method = problem.ArrivalModel("matern")
-    points = [np.full(4, value) for value in (0.0, 3.0, 6.0)]
-
-    def value_and_gradient(z, prior):
-        k = int(np.argmin([np.abs(z - point).max() for point in points]))
-        signs = np.array([1.0, 1.0, 1.0, -1.0 if k == 1 else 1.0]) * (np.nan if k == 2 else 1.0)
-        return 0.5 * signs @ (z - points[k]) ** 2, signs * (z - points[k])
-
-    searched(monkeypatch, value_and_gradient)
-    for order, kept in (([0, 1, 2], [0]), ([1, 0, 2], [1, 0])):
-        monkeypatch.setattr(learning, "run_searches", lambda *_, order=order, **__: (
-            [End(points[k], 0.0) for k in order], 3))
-        found = learning.find_modes(method, np.zeros((63, 1)))
-        np.testing.assert_array_equal([mode.point for mode in found], [points[k] for k in kept])
-    np.testing.assert_allclose(found[1].curvature.factor @ found[1].curvature.factor.T, np.eye(4), atol=1e-6)
-
-
-def made_up(settings):
+def synthetic_results(settings):
     """Results of every task: bands that hold all, and errors that follow from the method."""
-    one, results = window(), {}
+    call_window, results = window(), {}
     test = slice(problem.TEST_START + 1, None)
     for task in experiment.all_tasks(settings):
         method = task.settings["method"]
-        names = tracking.arrival_model_of(task).names
+        names = tracking.build_arrival_model(task).names
         worse = {"SQM": 1.0, "Matern": 3.0}.get(method, 2.0) * (0.9 if task.settings["what"] == "posterior" else 1.0)
-        found = {}
+        result = {}
         if task.settings["what"] == "nuts":
             results[task.name] = {f"{name}_ell": -70.0 for name in problem.TEST_RATES} | {
                 "mean": np.full(len(names), 0.1), "sd": np.full(len(names), 0.8), "ess": np.full(len(names), 150.0),
@@ -242,54 +155,57 @@ def made_up(settings):
             continue
         for name in problem.TEST_RATES:
             rmse = worse * (1.0 + 0.1 * np.arange(settings.days))
-            found |= {f"{name}_rmse": rmse, f"{name}_ell": -100.0 * rmse, f"{name}_rate_rmse": 0.1 * rmse,
-                      f"{name}_coverage": np.full(settings.days, 0.94),
-                      f"{name}_rate_coverage": np.full(settings.days, 0.9)}
+            result |= {f"{name}_rmse": rmse, f"{name}_ell": -100.0 * rmse, f"{name}_rate_rmse": 0.1 * rmse,
+                       f"{name}_coverage": np.full(settings.days, 0.94),
+                       f"{name}_rate_coverage": np.full(settings.days, 0.9)}
             if task.settings["what"] == "track":
-                x = np.log1p(one.queues[name])
-                found |= {f"{name}_log_queue": x, f"{name}_log_queue_sd": np.full(x.shape, 0.2),
-                          f"{name}_arrivals": np.append(0, one.arrivals), f"{name}_arrivals_sd": np.ones(x.shape)}
+                x = np.log1p(call_window.queues[name])
+                result |= {f"{name}_log_queue": x, f"{name}_log_queue_sd": np.full(x.shape, 0.2),
+                           f"{name}_arrivals": np.append(0, call_window.arrivals),
+                           f"{name}_arrivals_sd": np.ones(x.shape)}
         if task.settings["what"] == "track":
-            found |= {"z": np.zeros((settings.days, len(names))), "log_likelihood": np.full(settings.days, -50.0),
-                      "evaluations": np.full(settings.days, 40), "seconds": np.full(settings.days, 2.0)}
+            result |= {"z": np.zeros((settings.days, len(names))), "log_likelihood": np.full(settings.days, -50.0),
+                       "evaluations": np.full(settings.days, 40), "seconds": np.full(settings.days, 2.0)}
         else:
-            found |= {"k": np.full(settings.days, 0.3), "ess": np.full(settings.days, 90.0),
-                      "modes": np.arange(1, settings.days + 1), "beyond": 0.2 * np.arange(settings.days),
-                      "posterior_mean": np.zeros((settings.days, len(names))),
-                      "posterior_sd": np.ones((settings.days, len(names))),
-                      "shapes": np.append(0, one.arrivals), "shapes_sd": np.ones(one.queues["constant"].shape)}
-        results[task.name] = found
+            result |= {"k": np.full(settings.days, 0.3), "ess": np.full(settings.days, 90.0),
+                       "modes": np.arange(1, settings.days + 1), "beyond": 0.2 * np.arange(settings.days),
+                       "posterior_mean": np.zeros((settings.days, len(names))),
+                       "posterior_sd": np.ones((settings.days, len(names))),
+                       "shapes": np.append(0, call_window.arrivals),
+                       "shapes_sd": np.ones(call_window.queues["constant"].shape)}
+        results[task.name] = result
     assert test.start == 505
     return results
 
 
-MADE = experiment.CallCentreSettings(days=3, methods=("SQM", "periodic", "Matern"), integrated=("SQM",), nuts_days=2)
+SYNTHETIC = experiment.CallCentreSettings(days=3, methods=("SQM", "periodic", "Matern"), integrated=("SQM",),
+                                          nuts_days=2)
 
 
 def test_scores_are_those_of_the_log_normal_distribution():
-    one = window()
-    x = np.log1p(one.queues["constant"])
-    found = tracking.QueueEstimate(x + 0.1, np.full(x.shape, 0.1), np.append(0, one.arrivals) + 0.2,
-                                   np.full(x.shape, 0.05))
-    judged = tracking.score_mixture([found], one, "constant")
-    queue = one.queues["constant"][505:]
-    assert judged["rmse"] == pytest.approx(np.sqrt(np.mean(((1 + queue) * (np.exp(0.1) - 1)) ** 2)))
+    call_window = window()
+    x = np.log1p(call_window.queues["constant"])
+    estimate = tracking.QueueEstimate(x + 0.1, np.full(x.shape, 0.1), np.append(0, call_window.arrivals) + 0.2,
+                                      np.full(x.shape, 0.05))
+    mixture_scores = tracking.score_mixture([estimate], call_window, "constant")
+    queue = call_window.queues["constant"][505:]
+    assert mixture_scores["rmse"] == pytest.approx(np.sqrt(np.mean(((1 + queue) * (np.exp(0.1) - 1)) ** 2)))
     expected = stats.lognorm(0.1, scale=(1 + queue) * np.exp(0.1)).logpdf(1 + queue).sum()
-    assert judged["ell"] == pytest.approx(expected)
-    assert judged["coverage"] == 1.0 and judged["rate_coverage"] == 0.0
-    assert judged["rate_rmse"] == pytest.approx(0.2)
-    mixed = tracking.score_mixture([found, found], one, "constant")
-    assert mixed.keys() == judged.keys()
+    assert mixture_scores["ell"] == pytest.approx(expected)
+    assert mixture_scores["coverage"] == 1.0 and mixture_scores["rate_coverage"] == 0.0
+    assert mixture_scores["rate_rmse"] == pytest.approx(0.2)
+    mixed = tracking.score_mixture([estimate, estimate], call_window, "constant")
+    assert mixed.keys() == mixture_scores.keys()
     for key, value in mixed.items():
-        assert value == pytest.approx(judged[key], rel=1e-9), key
+        assert value == pytest.approx(mixture_scores[key], rel=1e-9), key
 
 
-def data_of(settings):
-    return experiment.STUDY.collect(settings, made_up(settings))
+def synthetic_data(settings):
+    return experiment.STUDY.collect(settings, synthetic_results(settings))
 
 
-def test_the_tables_hold_what_was_found():
-    tables = {name: table.frame for name, table in experiment.tables(MADE, data_of(MADE)).items()}
+def test_tables_summarize_results():
+    tables = {name: table.frame for name, table in experiment.tables(SYNTHETIC, synthetic_data(SYNTHETIC)).items()}
     table = tables["constant"]
     assert list(table.index) == ["SQM", "periodic", "Matern", "SQM, parameters integrated out"]
     assert table.loc["SQM", "RMSE"] == pytest.approx(1.1) and table.loc["SQM", "of Matern"] == pytest.approx(1 / 3)
@@ -308,43 +224,33 @@ def test_the_tables_hold_what_was_found():
     assert learnt.loc["SQM", "memory"] == 1.0 and np.isnan(learnt.loc["Matern", "memory"])
 
 
-def test_the_figures_are_drawn_and_labelled():
-    drawn = figures.draw(MADE, data_of(MADE))
-    assert list(drawn) == ["queue-constant", "queue-changed", "arrivals", "cycles", "errors"]
-    for figure in drawn.values():
-        assert figure.get_figwidth() == 7.0 and figure.legends
-        for axes in figure.axes:
-            assert axes.get_ylabel()
+def test_figures():
+    all_figures = figures.draw(SYNTHETIC, synthetic_data(SYNTHETIC))
+    assert list(all_figures) == ["queue-constant", "queue-changed", "arrivals", "cycles", "errors"]
 
 
 @pytest.mark.slow
-def test_what_is_stored_is_tabulated_and_drawn_without_computing(tmp_path):
-    results = made_up(MADE)
-    for task in experiment.all_tasks(MADE):
+def test_stored_results_are_tabulated_without_computing(tmp_path):
+    results = synthetic_results(SYNTHETIC)
+    for task in experiment.all_tasks(SYNTHETIC):
         write_result(task, results[task.name], RunStore(tmp_path / TASKS))
     lines = []
     with pytest.warns(counts.OverloadWarning, match="changed service rate: on 3 of 3 test days"):
-        found = experiment.STUDY.run(MADE, tmp_path, report=lines.append)
+        study_result = experiment.STUDY.run(SYNTHETIC, tmp_path, report=lines.append)
     assert lines[0].startswith("the counts are simulated") and lines[1] == "6 of 6 tasks are stored already"
-    kept = experiment.STUDY.save(found, tmp_path)
-    assert {path.name for path in kept} == {
+    files = experiment.STUDY.save(study_result, tmp_path)
+    assert {path.name for path in files} == {
         f"{stem}.{end}" for stem in ("constant", "changed", "gain", "agreement", "learnt") for end in ("csv", "md")} | {
         "queue-constant.png", "queue-changed.png", "arrivals.png", "cycles.png", "errors.png"}
-    assert scores.readable(found.tables["constant"]).loc["SQM", "published RMSE"] == "4.6 (2.2)"
+    assert scores.readable(study_result.tables["constant"]).loc["SQM", "published RMSE"] == "4.6 (2.2)"
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        experiment.STUDY.run(dataclasses.replace(MADE, seed=1), tmp_path)
+        experiment.STUDY.run(dataclasses.replace(SYNTHETIC, seed=1), tmp_path)
 
 
-def test_mistakes(tmp_path):
-    for wrong, message in (({"days": 0}, "days must be at least 1"), ({"methods": ("SQN",)}, "SQM"),
-                           ({"integrated": ("CQM",), "methods": ("SQM",)}, "integrated"),
-                           ({"nuts": (2, 10)}, "nuts must be chains, warm-up and draws"),
-                           ({"nuts": (2, 0, 10)}, "nuts: warm-up must be at least 1"),
-                           ({"integrated": "SQM"}, "a tuple of different labels, at least one"),
-                           ({"weekday": "Thrusday"}, "Did you mean 'Thursday'"), ({"link": "log"}, "link")):
-        with pytest.raises(ValueError, match=message):
-            experiment.CallCentreSettings(**wrong)
+def test_invalid_settings(tmp_path):
+    with pytest.raises(ValueError, match="integrated"):
+        experiment.CallCentreSettings(integrated=("CQM",), methods=("SQM",))
     with pytest.raises(ValueError, match="there are 31 test days on a Thursday, but 40 are requested"):
         experiment.STUDY.run(experiment.CallCentreSettings(days=40), tmp_path)
     with pytest.raises(FileNotFoundError, match="there is no file"):
@@ -352,109 +258,10 @@ def test_mistakes(tmp_path):
 
 
 @pytest.mark.slow
-def test_weighted_draws_are_those_of_a_long_chain():
-    """The posterior of one window against random-walk Metropolis with the same density."""
-    method, one = problem.ArrivalModel("sqm", functions=5), window()
-    draws, weights, _ = learning.sample_posterior(method, one.training, 1_000, 0)
-    weight = np.exp(weights.log_weight[0])
-    mean = weight @ draws
-    sd = np.sqrt(weight @ (draws - mean) ** 2)
-    density = lambda z: np.sum(problem.posterior(method).log_densities_of(z, one.training), axis=0)  # noqa: E731
-    factor = np.linalg.cholesky((draws - mean).T @ ((draws - mean) * weight[:, None]))
-    generator = np.random.default_rng(0)
-    at = mean + generator.normal(size=(20, 5)) @ factor.T
-    value, kept = density(at), []
-    for _ in range(600):
-        proposed = at + 2.4 / np.sqrt(5) * generator.normal(size=at.shape) @ factor.T
-        new = density(proposed)
-        accept = np.log(generator.uniform(size=20)) < new - value
-        at, value = np.where(accept[:, None], proposed, at), np.where(accept, new, value)
-        kept.append(at)
-    chain = np.array(kept[100:])
-    error = chain.mean(axis=0).std(axis=0) / np.sqrt(20) + sd / np.sqrt(float(np.ravel(weights.ess)[0]))
-    np.testing.assert_array_less(np.abs(chain.mean(axis=(0, 1)) - mean), 4 * error)
-
-
-@pytest.mark.slow
-def test_the_quick_version_runs_from_end_to_end(tmp_path):
+def test_quick_version(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", counts.OverloadWarning)
-        found = experiment.STUDY.run(experiment.CallCentreSettings.quick(days=1), tmp_path)
-    written = experiment.STUDY.save(found, tmp_path)
+        study_result = experiment.STUDY.run(experiment.CallCentreSettings.quick(days=1), tmp_path)
+    written = experiment.STUDY.save(study_result, tmp_path)
     assert len(written) == 15 and all(path.stat().st_size > 0 for path in written)
-    assert len(found.printed) == 5
-
-
-BOTH = experiment.CallCentreSettings(days=4, methods=("SQM",), functions=5, draws=2_000, mixed=5, nuts_days=4,
-                                     nuts=(2, 300, 700))
-"""Weighted draws and NUTS, on simulated days."""
-
-
-@pytest.mark.slow
-def test_nuts_and_weighted_draws_have_the_same_posterior():
-    """Two samplers that share the density and the modes about which they start, on the fourth window, which has one."""
-    task = tasks_of("nuts", BOTH)[3]
-    method, (one,) = tracking.arrival_model_of(task), tracking.windows_of(task)
-    draws, weights, mass = learning.sample_posterior(method, one.training, BOTH.draws, BOTH.seed)
-    assert len(mass) == 1 and weights.reliable
-    mean, covariance = importance_at_modes.moments(draws, np.exp(weights.log_weight[0]))
-    found = tracking.track_by_nuts(task)
-    assert found["divergences"] == 0 and found["r_hat"].max() < 1.02
-    error = np.sqrt(1 / found["ess"] + 1 / weights.ess)
-    assert error.max() < 0.1
-    assert (np.abs(found["mean"] - mean) < 4 * error * found["sd"]).all()
-    np.testing.assert_allclose(found["sd"], np.sqrt(np.diag(covariance)), rtol=4 * error.max())
-
-
-NOISE = 4
-"""Index of a parameter."""
-
-
-def with_two_modes(count):
-    """Return method, training, weighted draws and modes of the first window; the second mode is one of small noises."""
-    task = tasks_of("nuts", BOTH)[0]
-    method, (one,) = tracking.arrival_model_of(task), tracking.windows_of(task)
-    draws, weights, mass = learning.sample_posterior(method, one.training, count, BOTH.seed)
-    assert len(mass) == 2 and weights.reliable and method.names[NOISE] == "noise_sd"
-    return method, one.training, draws, np.exp(weights.log_weight[0]), learning.find_modes(method, one.training)
-
-
-@pytest.mark.slow
-def test_weighted_draws_see_a_second_mode():
-    """Its share of the posterior, against draws of one wide proposal over both modes."""
-    method, y, draws, weight, (first, second) = with_two_modes(4_000)
-    edge = 0.5 * (first.point + second.point)[NOISE]
-    below = draws[:, NOISE] < edge
-    share = weight[below].sum()
-    error = np.sqrt((weight**2 * (below - share) ** 2).sum())
-
-    scale = np.abs(first.point - second.point) / 2 + np.linalg.norm(first.curvature.factor, axis=1)
-    wide = stats.multivariate_t(0.5 * (first.point + second.point), np.diag(scale**2), df=5)
-    others = wide.rvs(60_000, random_state=1)
-    log_ratio = np.sum(problem.posterior(method).log_densities_of(others, y), axis=0) - wide.logpdf(others)
-    log_ratio = np.where(np.isfinite(log_ratio), log_ratio, -np.inf)
-    plain, there = np.exp(log_ratio - special.logsumexp(log_ratio)), others[:, NOISE] < edge
-    expected = plain[there].sum()
-    apart = np.hypot(error, np.sqrt((plain**2 * (there - expected) ** 2).sum()))
-    assert abs(share - expected) < 4 * apart and apart < share / 2
-
-
-@pytest.mark.slow
-def test_nuts_and_weighted_draws_agree_about_the_first_mode():
-    """NUTS comes to the second one by chance, and then stays for a hundred draws: it cannot tell how much is there."""
-    method, _, draws, weight, (first, second) = with_two_modes(4_000)
-    edge = 0.5 * (first.point + second.point)[NOISE]
-    above = draws[:, NOISE] > edge
-    assert weight[above].sum() > 0.98
-    own = weight[above] / weight[above].sum()
-    mean, covariance = importance_at_modes.moments(draws[above], own)
-    sd = np.sqrt(np.diag(covariance))
-    found = tracking.track_by_nuts(tasks_of("nuts", BOTH)[0])
-    elsewhere = found["draws"][NOISE] < edge
-    assert elsewhere.mean() < 0.5
-    chain = found["draws"][:, ~elsewhere]
-    ess = scores.diagnose(method.names, chain[:, None])["ess"]
-    error = np.sqrt(1 / ess + (own**2).sum())
-    assert error.max() < 0.1
-    assert (np.abs(chain.mean(axis=1) - mean) < 4 * error * sd).all()
-    np.testing.assert_allclose(chain.std(axis=1), sd, rtol=4 * error.max())
+    assert len(study_result.printed) == 5

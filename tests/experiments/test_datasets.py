@@ -5,58 +5,60 @@ import pytest
 import xarray as xr
 
 from lfm_ppl.experiments.datasets import TaskKind, cell, row, select_prefix
-from lfm_ppl.experiments.scores import Estimate, mean_of, rate_of
+from lfm_ppl.experiments.scores import Estimate, estimate_mean, estimate_rate
 from lfm_ppl.parallel.task import Task
 
 ENTRIES = {"dataset": "rmse, held", "dataset path": "coverage", "path time": "mean", "": "count, name"}
 
 
-def made(rule, first, last):
+def block_result(rule, first, last):
     """A block of results that say which data set and which path they are of."""
-    at = np.arange(first, last + 1)
+    index = np.arange(first, last + 1)
     bonus = 100.0 if rule == "CKF" else 0.0
-    return {"rmse": bonus + at, "held": at % 2 == 0, "coverage": bonus + at[:, None] + [0.25, 0.5],
+    return {"rmse": bonus + index, "held": index % 2 == 0, "coverage": bonus + index[:, None] + [0.25, 0.5],
             "mean": np.full((2, 3), bonus + first), "count": last - first + 1, "name": rule}
 
 
-def blocks(rule, *ends):
-    return [Task(f"{rule}/{first}", 0, {"rule": rule, "first": first, "last": last}) for first, last in ends]
+def blocks(rule, *bounds):
+    return [Task(f"{rule}/{first}", 0, {"rule": rule, "first": first, "last": last}) for first, last in bounds]
 
 
-def gathered(tasks, entries=ENTRIES, by=("rule",)):
-    kind = TaskKind(lambda task: made(task.settings["rule"], task.settings["first"], task.settings["last"]),
+def collect(tasks, entries=ENTRIES, by=("rule",)):
+    kind = TaskKind(lambda task: block_result(task.settings["rule"], task.settings["first"], task.settings["last"]),
                     entries, by)
     return kind.collect(tasks, {task.name: kind.compute(task) for task in tasks})
 
 
 def test_blocks_of_data_sets_follow_one_another():
-    found = gathered([*blocks("EKF", (0, 1), (2, 4)), *blocks("CKF", (0, 1), (2, 4))])
-    assert found["rmse"].dims == ("rule", "dataset") and found["coverage"].dims == ("rule", "dataset", "path")
-    assert found["rmse"].sel(rule="CKF").values.tolist() == [100.0, 101.0, 102.0, 103.0, 104.0]
-    assert found["held"].dtype == bool and found["held"].sel(rule="EKF").values.tolist() == [True, False] * 2 + [True]
+    dataset = collect([*blocks("EKF", (0, 1), (2, 4)), *blocks("CKF", (0, 1), (2, 4))])
+    assert dataset["rmse"].dims == ("rule", "dataset") and dataset["coverage"].dims == ("rule", "dataset", "path")
+    assert dataset["rmse"].sel(rule="CKF").values.tolist() == [100.0, 101.0, 102.0, 103.0, 104.0]
+    assert dataset["held"].dtype == bool
+    assert dataset["held"].sel(rule="EKF").values.tolist() == [True, False] * 2 + [True]
     # What has no data sets is that of the first block.
-    assert found["mean"].dims == ("rule", "path", "time") and (found["mean"].sel(rule="CKF") == 100.0).all()
-    assert found["count"].values.tolist() == [2, 2] and found["name"].values.tolist() == ["EKF", "CKF"]
+    assert dataset["mean"].dims == ("rule", "path", "time") and (dataset["mean"].sel(rule="CKF") == 100.0).all()
+    assert dataset["count"].values.tolist() == [2, 2] and dataset["name"].values.tolist() == ["EKF", "CKF"]
 
 
 def test_what_a_cell_lacks_is_missing():
-    found = gathered([*blocks("EKF", (0, 1), (2, 4)), *blocks("CKF", (0, 1))])
-    assert found["rmse"].sizes == {"rule": 2, "dataset": 5}
-    assert np.isnan(found["rmse"].sel(rule="CKF").values).tolist() == [False, False, True, True, True]
-    assert row(found.sel(rule="CKF"), {"RMSE": "rmse"})["RMSE"] == 100.5
-    kind = TaskKind(made, {"dataset": "rmse, k"}, ("rule",))
+    dataset = collect([*blocks("EKF", (0, 1), (2, 4)), *blocks("CKF", (0, 1))])
+    assert dataset["rmse"].sizes == {"rule": 2, "dataset": 5}
+    assert np.isnan(dataset["rmse"].sel(rule="CKF").values).tolist() == [False, False, True, True, True]
+    assert row(dataset.sel(rule="CKF"), {"RMSE": "rmse"})["RMSE"] == 100.5
+    kind = TaskKind(block_result, {"dataset": "rmse, k"}, ("rule",))
     tasks = [Task(rule, 0, {"rule": rule, "index": 0}) for rule in ("EKF", "CKF")]
-    found = kind.collect(tasks, {"EKF": {"rmse": 1.0}, "CKF": {"rmse": 2.0, "k": 0.5}})
-    assert np.isnan(found.k.sel(rule="EKF")).all() and found.k.sel(rule="CKF").item() == 0.5
+    dataset = kind.collect(tasks, {"EKF": {"rmse": 1.0}, "CKF": {"rmse": 2.0, "k": 0.5}})
+    assert np.isnan(dataset.k.sel(rule="EKF")).all() and dataset.k.sel(rule="CKF").item() == 0.5
     assert "k" not in kind.collect(tasks[:1], {"EKF": {"rmse": 1.0}})
 
 
 def test_what_is_no_number_is_filled_up_as_well():
-    found = gathered([*blocks("EKF", (0, 1)), *blocks("CKF", (0, 0))], {"dataset": "held"})
-    assert found["held"].sel(rule="EKF").values.tolist() == [1.0, 0.0] and np.isnan(found["held"].values[1, 1])
+    dataset = collect([*blocks("EKF", (0, 1)), *blocks("CKF", (0, 0))], {"dataset": "held"})
+    assert dataset["held"].sel(rule="EKF").values.tolist() == [1.0, 0.0] and np.isnan(dataset["held"].values[1, 1])
     tasks = [Task(rule, 0, {"rule": rule, "index": 0}) for rule in ("EKF", "CKF")]
-    found = TaskKind(made, {"": "why, k"}, ("rule",)).collect(tasks, {"EKF": {"why": "a gap"}, "CKF": {"k": 1.0}})
-    assert found["why"].values.tolist() == ["a gap", ""]
+    kind = TaskKind(block_result, {"": "why, k"}, ("rule",))
+    dataset = kind.collect(tasks, {"EKF": {"why": "a gap"}, "CKF": {"k": 1.0}})
+    assert dataset["why"].values.tolist() == ["a gap", ""]
 
 
 def test_an_entry_that_some_tasks_of_a_cell_lack_is_an_error():
@@ -64,45 +66,46 @@ def test_an_entry_that_some_tasks_of_a_cell_lack_is_an_error():
     for lacking in ("EKF/0", "EKF/1"):
         results = {task.name: {} if task.name == lacking else {"k": 1.0} for task in tasks}
         with pytest.raises(ValueError, match=f"'k' is missing in the result of {lacking}"):
-            TaskKind(made, {"dataset": "k"}, ("rule",)).collect(tasks, results)
+            TaskKind(block_result, {"dataset": "k"}, ("rule",)).collect(tasks, results)
 
 
 def test_several_settings_become_dimensions():
     tasks = [Task(f"{store}/{rule}/{index}", 0, {"store": store, "rule": rule, "index": index})
              for index in range(3) for store, rule in (("one", "EKF"), ("one", "CKF"), ("two", "CKF"))]
     results = {task.name: {"rmse": float(task.settings["index"])} for task in tasks}
-    found = TaskKind(made, {"dataset": "rmse"}, ("store", "rule")).collect(tasks, results)
-    assert found["rmse"].sizes == {"store": 2, "rule": 2, "dataset": 3}
-    assert found["rmse"].sel(store="two", rule="CKF").values.tolist() == [0.0, 1.0, 2.0]
-    assert np.isnan(found["rmse"].sel(store="two", rule="EKF")).all()
-    alone = TaskKind(made, {"dataset": "rmse"}).collect(tasks[:1], results)
-    assert alone["rmse"].sizes == {"dataset": 1}
+    dataset = TaskKind(block_result, {"dataset": "rmse"}, ("store", "rule")).collect(tasks, results)
+    assert dataset["rmse"].sizes == {"store": 2, "rule": 2, "dataset": 3}
+    assert dataset["rmse"].sel(store="two", rule="CKF").values.tolist() == [0.0, 1.0, 2.0]
+    assert np.isnan(dataset["rmse"].sel(store="two", rule="EKF")).all()
+    single = TaskKind(block_result, {"dataset": "rmse"}).collect(tasks[:1], results)
+    assert single["rmse"].sizes == {"dataset": 1}
 
 
 def test_a_part_has_the_names_without_what_they_begin_with():
-    found = xr.Dataset({"filter_rmse": 1.0, "filter_sd": 2.0, "filters": 3.0, "smoother_rmse": 4.0})
-    assert {name: value.item() for name, value in select_prefix(found, "filter").items()} == {"rmse": 1.0, "sd": 2.0}
+    dataset = xr.Dataset({"filter_rmse": 1.0, "filter_sd": 2.0, "filters": 3.0, "smoother_rmse": 4.0})
+    assert {name: value.item() for name, value in select_prefix(dataset, "filter").items()} == {"rmse": 1.0, "sd": 2.0}
 
 
 def test_a_row_has_means_shares_and_numbers():
     rmse, held = np.array([1.0, 2.0, 6.0]), np.array([True, True, False])
-    found = xr.Dataset({"rmse": ("dataset", rmse), "held": ("dataset", held), "k": ("dataset", [0.1, 0.2, 0.9])})
-    cells = row(found, {"RMSE": "rmse", "held": "held", "k > 0.7": lambda one: (one.k > 0.7).mean(),
-                        "largest": lambda one: Estimate(6.0, 0.5), "kind": lambda one: "plain", "count": lambda one: 3})
-    assert cells == {"RMSE": 3.0, "RMSE se": mean_of(rmse).error, "held": pytest.approx(2 / 3),
-                     "held se": rate_of(held).error, "k > 0.7": pytest.approx(1 / 3), "largest": 6.0, "largest se": 0.5,
-                     "kind": "plain", "count": 3}
+    dataset = xr.Dataset({"rmse": ("dataset", rmse), "held": ("dataset", held), "k": ("dataset", [0.1, 0.2, 0.9])})
+    cells = row(dataset, {"RMSE": "rmse", "held": "held", "k > 0.7": lambda results: (results.k > 0.7).mean(),
+                          "largest": lambda results: Estimate(6.0, 0.5), "kind": lambda results: "plain",
+                          "count": lambda results: 3})
+    assert cells == {"RMSE": 3.0, "RMSE se": estimate_mean(rmse).error, "held": pytest.approx(2 / 3),
+                     "held se": estimate_rate(held).error, "k > 0.7": pytest.approx(1 / 3),
+                     "largest": 6.0, "largest se": 0.5, "kind": "plain", "count": 3}
     assert type(cells["count"]) is int and type(cells["k > 0.7"]) is float
 
 
 def test_a_name_stands_for_a_column_of_each_entry():
-    found = xr.Dataset({"rmse": (("dataset", "path"), np.array([[1.0, 10.0], [3.0, 30.0]]))},
-                       {"path": ["x", "v"], "unit": ("path", ["m", "m/s"])})
-    assert list(row(found, {"RMSE {path} ({unit})": "rmse"})) == [
+    dataset = xr.Dataset({"rmse": (("dataset", "path"), np.array([[1.0, 10.0], [3.0, 30.0]]))},
+                         {"path": ["x", "v"], "unit": ("path", ["m", "m/s"])})
+    assert list(row(dataset, {"RMSE {path} ({unit})": "rmse"})) == [
         "RMSE x (m)", "RMSE x (m) se", "RMSE v (m/s)", "RMSE v (m/s) se"]
-    assert row(found, {"{path}": lambda one: one.rmse.max()}) == {"x": 3.0, "v": 30.0}
+    assert row(dataset, {"{path}": lambda results: results.rmse.max()}) == {"x": 3.0, "v": 30.0}
     # Of one entry alone, that is not a dimension any more, the name has the label.
-    assert row(found.sel(path="v"), {"RMSE {path}": "rmse"})["RMSE v"] == 20.0
+    assert row(dataset.sel(path="v"), {"RMSE {path}": "rmse"})["RMSE v"] == 20.0
     levels = xr.Dataset({"share": ("level", [0.4, 0.9])}, {"level": [0.5, 0.95]})
     assert row(levels, {"coverage {level:.0%}": "share"}) == {"coverage 50%": 0.4, "coverage 95%": 0.9}
 

@@ -49,7 +49,7 @@ def collect(monkeypatch):
         monkeypatch.setattr(problem, "arcs", lambda folder, seed=0: problem.Arcs(None, TIMES, positions, None))
         settings = experiment.GpsSettings(alternatives=sum(name.startswith("ways/") for name in other_results))
         results = {f"learn/{name}": learning_result() for name in predictions}
-        results |= {f"predict/{name}": one for name, one in predictions.items()}
+        results |= {f"predict/{name}": prediction for name, prediction in predictions.items()}
         return settings, experiment.STUDY.collect(settings, results | other_results)
 
     return collect
@@ -148,7 +148,7 @@ def test_tables(collect):
     assert sizes.loc["amplitude of panel 2", "common"] == pytest.approx(0.05) and (sizes["G01"] == 1.0).all()
     pooled = tables["pooled"].frame
     assert list(pooled.index) == ["without gaps", "without gaps, never in shadow", "without gaps, in shadow",
-                                    "with gaps"]
+                                  "with gaps"]
     row = pooled.loc["without gaps"]
     assert row["satellites"] == 2 and row["improved"] == 2
     assert row["deterministic"] == pytest.approx(np.sqrt(3 * (10.0**2 + 20.0**2) / 2))
@@ -222,7 +222,7 @@ def test_figures(collect):
     online = {"times": TIMES, "observed": TIMES < 72, "lfm": np.ones((960, 3)), "sd": np.ones((960, 3)),
               "restarted": np.full((960, 3), 2.0), "cpu_s": 1.0}
     all_figures = figures.draw(*collect({"G01": result(10.0), "G02": result(20.0, eclipsed=True)},
-                                 {"ways/G01": COMPARISON, "online/G01": online}))
+                                        {"ways/G01": COMPARISON, "online/G01": online}))
     assert set(all_figures) == {"all", "errors-G01", "forces-G01", "online-G01"}
     labels = {axes.get_ylabel() for figure in all_figures.values() for axes in figure.axes}
     assert {"error (m)", "error after training (m)", "solar (nm/s²)"} <= labels

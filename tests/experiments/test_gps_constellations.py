@@ -22,7 +22,7 @@ def face(sun, normal, area, specular, diffuse):
 
 def push(environment, r, t, body):
     """Acceleration (km/h^2) by light, on a body and on panels that nearly point to the Sun, and by a thrust."""
-    # Areas are about those of a Galileo satellite, whose body is longer than wide.
+    # Areas resemble a Galileo satellite, whose body is longer than wide.
     light = jnp.linalg.norm(environment.solar_pressure(r, t))  # of one nm/s^2, zero in the shadow
     sun = environment.sun(t) - r
     sun = sun / jnp.linalg.norm(sun)
@@ -65,9 +65,9 @@ def constellation(letter, count, radius, inclination, seed=0):
         node, along = 2 * np.pi * (number % 3) / 3 + random.uniform(0, 0.1), random.uniform(0, 2 * np.pi)
         start = problem.circular(node, along, radius, inclination)
         body = {"tilt": random.normal(0, 0.01), "lag": random.normal(0, 0.01), "body": random.uniform(0.8, 1.2),
-               "scale": random.uniform(0.95, 1.05), "thrust": random.uniform(0.8, 1.5)}
+                "scale": random.uniform(0.95, 1.05), "thrust": random.uniform(0.8, 1.5)}
         positions[f"{letter}{number + 1:02d}"] = (np.asarray(path(jnp.asarray(start), body))
-                                              + NOISE * random.normal(size=(len(times), 3)))
+                                                  + NOISE * random.normal(size=(len(times), 3)))
     return problem.Arcs(environment, times, positions, None)
 
 

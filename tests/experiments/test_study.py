@@ -36,7 +36,7 @@ def tasks(settings):
 
 
 def later(settings, results):
-    return [Task("all", settings.seed, {"what": "sum", "of": [float(one["value"]) for one in results.values()]})]
+    return [Task("all", settings.seed, {"what": "sum", "of": [float(result["value"]) for result in results.values()]})]
 
 
 def tabulated(settings, data):
@@ -66,19 +66,19 @@ STUDY = Study(
 
 
 def test_a_run_computes_tabulates_and_draws_and_goes_on(tmp_path):
-    found = STUDY.run(ExampleSettings.quick(runs=4), tmp_path)
-    assert found.tables["squares"].loc["all", ["mean", "sum"]].tolist() == [3.5, 14.0]
-    assert list(found.tables) == ["squares", "hidden"] and list(found.printed) == ["Squares", "Left out"]
-    assert found.printed["Squares"].loc["all", "mean"] == "3.5 (2.0)"  # of 0, 1, 4 and 9
-    assert found.notes == ("4 squares",)
-    assert found.data["square"]["value"].sel(dataset=2).item() == 4 and len(found.results) == 5
-    assert found.data["square"].number.dims == ("dataset",) and found.data["sum"]["value"].shape == ()
-    written = STUDY.save(found, tmp_path)
+    result = STUDY.run(ExampleSettings.quick(runs=4), tmp_path)
+    assert result.tables["squares"].loc["all", ["mean", "sum"]].tolist() == [3.5, 14.0]
+    assert list(result.tables) == ["squares", "hidden"] and list(result.printed) == ["Squares", "Left out"]
+    assert result.printed["Squares"].loc["all", "mean"] == "3.5 (2.0)"  # of 0, 1, 4 and 9
+    assert result.notes == ("4 squares",)
+    assert result.data["square"]["value"].sel(dataset=2).item() == 4 and len(result.results) == 5
+    assert result.data["square"].number.dims == ("dataset",) and result.data["sum"]["value"].shape == ()
+    written = STUDY.save(result, tmp_path)
     assert [path.name for path in written] == ["squares.csv", "squares.md", "hidden.csv", "hidden.md", "squares.png"]
     lines = []
-    again = STUDY.run(ExampleSettings.quick(runs=4), tmp_path, report=lines.append)
+    resumed = STUDY.run(ExampleSettings.quick(runs=4), tmp_path, report=lines.append)
     assert lines == ["4 of 4 tasks are stored already", "1 of 1 tasks are stored already"]
-    assert again.tables["squares"].equals(found.tables["squares"])
+    assert resumed.tables["squares"].equals(result.tables["squares"])
     with pytest.raises(ValueError, match="seed is 0 there and 1 now"):
         STUDY.run(ExampleSettings.quick(runs=4, seed=1), tmp_path)
 
@@ -100,13 +100,14 @@ def test_the_quick_version_keeps_what_is_given():
 
 
 def test_the_options_are_the_fields():
-    found = {one.name: one for one in study.options(ExampleSettings)}
-    assert list(found) == ["runs", "left_out", "scale", "kind", "most", "names", "counts", "nuts", "data", "seed"]
-    assert found["runs"].flags == ["--runs", "--realisations", "--datasets"]
-    assert found["left_out"].flags == ["--left-out"]
-    assert (found["names"].value_type, found["names"].is_sequence, found["names"].is_optional) == (str, True, False)
-    assert (found["nuts"].value_type, found["nuts"].is_sequence) == (int, False)
-    assert (found["most"].value_type, found["most"].is_optional, found["most"].default) == (int, True, None)
+    options = {option.name: option for option in study.options(ExampleSettings)}
+    assert list(options) == ["runs", "left_out", "scale", "kind", "most", "names", "counts", "nuts", "data", "seed"]
+    assert options["runs"].flags == ["--runs", "--realisations", "--datasets"]
+    assert options["left_out"].flags == ["--left-out"]
+    names = options["names"]
+    assert (names.value_type, names.is_sequence, names.is_optional) == (str, True, False)
+    assert (options["nuts"].value_type, options["nuts"].is_sequence) == (int, False)
+    assert (options["most"].value_type, options["most"].is_optional, options["most"].default) == (int, True, None)
 
 
 @pytest.mark.parametrize("wrong, message", [
@@ -133,8 +134,8 @@ def test_what_is_compiled_at_the_first_call_is_not_timed():
     calls = []
     for label in ("a test", "another test", "a test"):
         calls.append(label)
-        seconds, found = timing.time_compiled_call(label, lambda: calls.append("called") or len(calls))
-        assert seconds >= 0.0 and found == len(calls)
+        seconds, value = timing.time_compiled_call(label, lambda: calls.append("called") or len(calls))
+        assert seconds >= 0.0 and value == len(calls)
     assert calls == ["a test", "called", "called", "another test", "called", "called", "a test", "called"]
 
 
@@ -146,9 +147,9 @@ def test_a_legend_has_each_label_once():
 def test_published_errors_have_errors_of_their_own():
     frame = pd.DataFrame({"RMSE": [1.0, 2.0, 3.0, 4.0], "RMSE se": [0.3, 0.3, 0.3, np.nan],
                           "source": [4.0, 2.5, np.nan, 1.0], "source se": [0.4, 0.4, np.nan, 0.4]}, list("abcd"))
-    found = published.compare_with_published(frame, "RMSE", "source")
-    assert {row: str(one) for row, one in found.items()} == {
+    comparisons = published.compare_with_published(frame, "RMSE", "source")
+    assert {row: str(comparison) for row, comparison in comparisons.items()} == {
         "a": "lower than published (z = -6.0)", "b": "consistent", "d": "-"}
-    assert published.describe_comparisons("RMSE", found) == (
+    assert published.describe_comparisons("RMSE", comparisons) == (
         "RMSE: 2 of 2 cells count as consistent with the published table, 1 of them lower than published; 0 higher. a: "
         "lower than published (z = -6.0).")

@@ -38,7 +38,7 @@ def test_the_likelihood_at_the_truth_is_that_of_the_known_system():
 
 def test_true_values_stand_in_the_order_of_the_names():
     data = problem.data_set(SOFTPLUS, 4)
-    named = dict(zip(parameters.NAMES, parameters.true_values(data), strict=True))
+    named = dict(zip(parameters.NAMES, parameters.true_parameters(data), strict=True))
     for site, value in sites(data).items():
         for gene in range(problem.GENES):
             name = site if np.ndim(value) == 0 else f"{site}[{gene + 1}]"
@@ -85,7 +85,7 @@ def test_a_chain_that_stands_still_shows():
     two = dataclasses.replace(FEW, datasets=2)
     results = synthetic_results(two)
     constant_task = next(task.name for task in parameters_report.tasks(two) if task.settings["index"] == 1
-                 and task.settings["sampler"] == "RAM, marginal" and task.settings["link"] == "softplus")
+                         and task.settings["sampler"] == "RAM, marginal" and task.settings["link"] == "softplus")
     for name, value in (("ess", np.nan), ("r_hat", np.nan), ("sd", 0.0)):
         results[constant_task][name][3] = value
     row = tabulate(results, two).tables["agreement"].loc["softplus: RAM, marginal"]
@@ -100,21 +100,6 @@ def test_the_figures_are_labelled():
         upper, lower = figure.axes
         assert upper.get_ylabel() and lower.get_xlabel() and lower.get_ylabel() and figure.legends
         assert [text.get_text() for text in upper.get_xticklabels()] == list(parameters.NAMES)
-
-
-def test_mistakes():
-    with pytest.raises(ValueError, match="datasets must be at least 1"):
-        parameters_report.TranscriptionParametersSettings(datasets=0)
-    with pytest.raises(ValueError, match="unknown links 'cubic'"):
-        parameters_report.TranscriptionParametersSettings(links=("cubic",))
-    with pytest.raises(ValueError, match="a tuple of different labels"):
-        parameters_report.TranscriptionParametersSettings(links=())
-    with pytest.raises(ValueError, match="chains, warm-up, draws and thinning"):
-        parameters_report.TranscriptionParametersSettings(nuts=(2, 10, 10))
-    with pytest.raises(ValueError, match="ram: chains must be at least 1"):
-        parameters_report.TranscriptionParametersSettings(ram=(0, 1, 1, 1))
-    with pytest.raises(ValueError, match="tree_depth must be at least 1"):
-        parameters_report.TranscriptionParametersSettings(tree_depth=0)
 
 
 def settings_of(label, chains, warmup, draws, thin):
@@ -149,7 +134,7 @@ def test_on_a_linear_link_marginal_and_latent_posteriors_are_the_same():
 @pytest.mark.slow
 def test_draws_are_taken_as_often_as_the_iterated_likelihood_says():
     data = problem.data_set(SOFTPLUS, 4)
-    truth = parameters.true_values(data)
+    truth = parameters.true_parameters(data)
     draws = truth[:, None, None] * np.random.default_rng(0).uniform(0.8, 1.2, (len(truth), 2, 20))
 
     def log_likelihood(theta, iterations):
@@ -163,7 +148,7 @@ def test_draws_are_taken_as_often_as_the_iterated_likelihood_says():
     ratio = jax.vmap(lambda theta: log_likelihood(theta, 2) - log_likelihood(theta, 0))(flat)
     smoothed, k = arviz_data.psis(np.asarray(ratio))
     weight = np.exp(smoothed).reshape(2, 20)
-    resampled, found_k = parameters._weighted({"link": "softplus", "gamma": None}, 2, data, draws)
+    resampled, found_k = parameters._resample_draws({"link": "softplus", "gamma": None}, 2, data, draws)
     assert resampled.shape == draws.shape and found_k == pytest.approx(k)
     for chain, weights in enumerate(weight / weight.sum(axis=1, keepdims=True)):
         counts = [(resampled[0, chain] == value).sum() for value in draws[0, chain]]

@@ -87,11 +87,11 @@ def test_the_posterior_covers_the_truth(file, functions, simulated):
         truth = np.asarray(drawn.forces[functions["FORCE"]]) + np.log(theta[0])
         of_rate.append(scores.interval_coverage(*scores.interval(mean, sd), truth))
     half = [0.25 < rank < 0.75 for rank in ranks]
-    print("R0", scores.rate_of(of_r0), "half", scores.rate_of(half), "transmission", scores.mean_of(of_rate),
-          "Pareto k", np.quantile(pareto, (0.5, 0.9, 1.0)).round(2))
+    print("R0", scores.estimate_rate(of_r0), "half", scores.estimate_rate(half), "transmission",
+          scores.estimate_mean(of_rate), "Pareto k", np.quantile(pareto, (0.5, 0.9, 1.0)).round(2))
     for held, nominal in ((of_r0, 0.95), (half, 0.5)):
         assert abs(np.mean(held) - nominal) < 3 * np.sqrt(nominal * (1 - nominal) / EPIDEMICS)
-    rate = scores.mean_of(of_rate)
+    rate = scores.estimate_mean(of_rate)
     assert abs(rate.value - 0.95) < 3 * rate.error
 
 

@@ -18,7 +18,7 @@ def test_a_day_ahead_with_a_thousand_particles(benchmark):
     z = model.medians
 
     def predict():
-        return jax.block_until_ready(prediction.thermostat_ahead(model, window, z, 1000, jax.random.key(0))[1])
+        return jax.block_until_ready(prediction.predict_under_thermostat(model, window, z, 1000, jax.random.key(0))[1])
 
     found = predict()
     assert np.isfinite(found.mean).all() and found.inputs.shape == (149, 1000)

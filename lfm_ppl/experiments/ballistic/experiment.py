@@ -20,18 +20,13 @@ import numpy as np
 from scipy import stats
 
 from lfm_ppl.experiments import chains, study
-from lfm_ppl.experiments.ballistic import figures
-from lfm_ppl.experiments.ballistic.problem import TARGETS
+from lfm_ppl.experiments.ballistic import figures, parameters, states
+from lfm_ppl.experiments.ballistic.problem import NAMES, PATHS, RECORDS_PER_SEED, true_z
 from lfm_ppl.experiments.datasets import Column, TaskKind, row, rows, select_prefix
-from lfm_ppl.experiments.scores import paired_ratio, sd_of
-from lfm_ppl.experiments.simulated import parameters, states
-from lfm_ppl.experiments.simulated.problem import RECORDS_PER_SEED, true_z
+from lfm_ppl.experiments.scores import paired_ratio, sample_sd
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import TaskFactory, slug, sort_by_dataset
 from lfm_ppl.parallel.task import Task
-
-REACH = 1.5
-"""Half the width of the grid about the true log alpha, about six posterior standard deviations."""
 
 UNKNOWN = {"most likely parameters": "likely", "parameters integrated out": "posterior"}
 """Label of a smoother with unknown parameters -> prefix of its entries."""
@@ -131,7 +126,7 @@ PARTICLE_FILTER: dict[str, Column] = {
     "RMSE {path} ({unit})": "rmse", "ratio {path}": lambda paired: paired_ratio(paired.exact_rmse, paired.rmse),
     "CPU s": "seconds", "times as long": lambda paired: paired.seconds.mean() / paired.exact_seconds.mean(),
     "log likelihood - Gaussian": lambda paired: paired.log_likelihood - paired.exact_log_likelihood,
-    "its sd": lambda paired: sd_of(paired.log_likelihood - paired.exact_log_likelihood)}
+    "its sd": lambda paired: sample_sd(paired.log_likelihood - paired.exact_log_likelihood)}
 """Columns of the table of particles."""
 
 DISTINCT: dict[str, Column] = {"distinct": lambda paired: paired.distinct.isel(time=0).mean()}
@@ -148,9 +143,9 @@ def summarize_parameters(data: Data) -> dict[str, Any]:
     ``k > 0.7`` is the share of targets with unreliable weights.
     """
     most_likely: dict[str, Column] = {
-        "truth": lambda targets: true_z(TARGETS)[TARGETS.names.index(targets.parameter)],
+        "truth": lambda targets: true_z()[NAMES.index(targets.parameter)],
         "maximum": "exists", "most likely": lambda targets: targets.likely[targets.exists],
-        "its sd": lambda targets: sd_of(targets.likely[targets.exists]), "posterior mean": "posterior_mean"}
+        "its sd": lambda targets: sample_sd(targets.likely[targets.exists]), "posterior mean": "posterior_mean"}
     posterior: dict[str, Column] = {
         "posterior sd": "posterior_sd", **COVERAGE, "k > 0.7": lambda targets: (targets.k > 0.7).mean()}
     return {**rows(data["parameters"], "parameter", most_likely | posterior, "log {}"),
@@ -178,21 +173,21 @@ def agreement(data: Data) -> dict[str, Any]:
 
 
 KINDS = {
-    "tracking": TaskKind(partial(states.run_gaussian, TARGETS), {
+    "tracking": TaskKind(states.run_gaussian, {
         "dataset path": "filter_rmse, smoother_rmse, smoother_coverage", "path time": "mean, sd",
         "dataset": "log_likelihood, filter_seconds, smoother_seconds"}, ("method",)),
-    "particles": TaskKind(partial(states.run_particles, TARGETS), {
+    "particles": TaskKind(states.run_particles, {
         "dataset path": "filter_rmse, smoother_rmse, smoother_coverage", "dataset path time": "mean, sd",
         "dataset": "log_likelihood, filter_seconds, smoother_seconds", "dataset time": "distinct"}, ("particles",)),
-    **{kind: TaskKind(partial(parameters.estimate_all, TARGETS, from_prior=kind == "drawn"), {
+    **{kind: TaskKind(partial(parameters.estimate_targets, from_prior=kind == "drawn"), {
         "dataset parameter": "likely, posterior_mean, posterior_sd, below", "dataset": "exists, k, ess, seconds",
         "dataset path": "likely_rmse, likely_coverage, posterior_rmse, posterior_coverage", "parameter draw": "draws"})
        for kind in ("parameters", "drawn")},
-    "known": TaskKind(partial(parameters.rank_all, TARGETS, REACH), {"dataset": "below"}),
-    "chains": TaskKind(partial(parameters.sample_chains, TARGETS), {
+    "known": TaskKind(parameters.rank_targets, {"dataset": "below"}),
+    "chains": TaskKind(parameters.sample_chains, {
         "dataset parameter": "mean, sd, ess, r_hat", "dataset": "seconds, divergences",
         "dataset parameter chain draw": "draws"}, ("sampler",)),
 }
 
 STUDY = Study(BallisticSettings, all_tasks, KINDS, tables, figures.draw, {
-    "path": ("path", TARGETS.paths), "unit": ("path", TARGETS.units), "parameter": ("parameter", TARGETS.names)})
+    "path": ("path", tuple(PATHS)), "unit": ("path", tuple(PATHS.values())), "parameter": ("parameter", NAMES)})

@@ -8,13 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-from lfm_ppl.experiments.ballistic.problem import TARGETS
+from lfm_ppl.experiments.ballistic import parameters
+from lfm_ppl.experiments.ballistic.problem import NAMES, PATHS, simulate_target, true_z
+from lfm_ppl.experiments.ballistic.states import DEFAULT_RULE
 from lfm_ppl.experiments.datasets import select_prefix
 from lfm_ppl.experiments.drawing import SHADE, SPAN, TRUTH, band, bars, legend, line, patch
-from lfm_ppl.experiments.scores import Z, mean_of, paired_ratio, rate_of
-from lfm_ppl.experiments.simulated import parameters
-from lfm_ppl.experiments.simulated.problem import simulate_record, true_z
-from lfm_ppl.experiments.simulated.states import DEFAULT_RULE
+from lfm_ppl.experiments.scores import Z, estimate_mean, estimate_rate, paired_ratio
 from lfm_ppl.experiments.study import Data
 from lfm_ppl.results.plots import style
 
@@ -35,12 +34,12 @@ def draw(settings: Any, data: Data) -> dict[str, Figure]:
 @style.styled
 def plot_paths(data: Data, seed: int = 0, *, width: str | float = "full") -> Figure:
     """Draw smoothed paths of the first target with 95% bands (figure 1 a to c of the source), and their errors."""
-    target, smoothed = simulate_record(TARGETS, 0, seed), data["tracking"].sel({"method": DEFAULT_RULE})
+    target, smoothed = simulate_target(0, seed), data["tracking"].sel({"method": DEFAULT_RULE})
     particles = data["particles"].isel(dataset=0).sortby("particles").isel(particles=-1)
     figure = style.new_figure(width, 3.8)
-    for index, (upper, lower) in enumerate(figure.subplots(2, len(TARGETS.paths), sharex=True).T):
+    for index, (upper, lower) in enumerate(figure.subplots(2, len(PATHS), sharex=True).T):
         mean, sd, truth = smoothed["mean"][index], smoothed["sd"][index], target.paths[index]
-        (factor, unit), path = _SCALES[index], TARGETS.paths[index]
+        (factor, unit), (path, error_unit) = _SCALES[index], tuple(PATHS.items())[index]
         upper.plot(target.times, factor * mean, color=style.BLUE, label="Gaussian smoother")
         band(upper, target.times, factor * mean, factor * sd, label="its 95% band")
         upper.plot(target.times, factor * truth, **TRUTH)
@@ -50,7 +49,7 @@ def plot_paths(data: Data, seed: int = 0, *, width: str | float = "full") -> Fig
                    label=f"{int(particles.particles):,} particles")
         lower.axhline(0.0, color=style.BLACK, lw=0.6)
         style.tidy(upper, ylabel=style.with_unit(path, unit), xlim=target.times[[0, -1]])
-        style.tidy(lower, ylabel=style.with_unit(f"error of {path}", TARGETS.units[index], 24), xlabel="time (s)")
+        style.tidy(lower, ylabel=style.with_unit(f"error of {path}", error_unit, 24), xlabel="time (s)")
     legend(figure)
     return figure
 
@@ -62,7 +61,7 @@ def plot_particles(data: Data, *, width: str | float = "full") -> Figure:
     counts, targets = particles.particles.values, particles.sizes["dataset"]
     gaussian = data["tracking"].sel({"method": DEFAULT_RULE}).isel(dataset=slice(targets))
     figure, (ratio_axes, time_axes) = style.in_a_row(width, 2, 2.5)
-    for index, path in enumerate(TARGETS.paths):
+    for index, path in enumerate(PATHS):
         ratios = [paired_ratio(rmse[:, index], gaussian.smoother_rmse[:, index]) for rmse in particles.smoother_rmse]
         bars(ratio_axes, counts * 1.06 ** (index - 1), ratios, color=COLOURS[index], ls=LINES[index],
              marker=MARKERS[index], lw=1.0, label=path)
@@ -86,7 +85,7 @@ def plot_drag(data: Data, *, width: str | float = "full") -> Figure:
 
     The first panel is figure 1 d of the source.
     """
-    truth = true_z(TARGETS)[0]
+    truth = true_z()[0]
     estimates, prior_estimates = (data[kind].isel(parameter=0) for kind in ("parameters", "drawn"))
     figure, (density_axes, target_axes, rank_axes) = style.in_a_row(width, 3, 2.5)
     chain = data["chains"].draws.sel(sampler="NUTS").isel(dataset=0, parameter=0).values.ravel()
@@ -132,19 +131,19 @@ def plot_coverage(data: Data, *, width: str | float = "full") -> Figure:
     path_axes.axhspan(0.93, 0.97, color=SPAN, lw=0)
     path_axes.axhline(0.95, color=style.BLACK, lw=0.8)
     parameter_axes.plot([0.4, 1.0], [0.4, 1.0], color=style.BLACK, lw=0.8)
-    for index, name in enumerate(TARGETS.names):
+    for index, name in enumerate(NAMES):
         bars(path_axes, np.arange(len(smoothers)) + 0.12 * (index - 1),
-             [mean_of(coverage[:, index]) for coverage in smoothers.values()],
+             [estimate_mean(coverage[:, index]) for coverage in smoothers.values()],
              color=COLOURS[index], marker=MARKERS[index])
         distance = np.abs(estimates.below[:, index] - 0.5)
-        bars(parameter_axes, levels + 0.006 * (index - 1), [rate_of(distance <= level / 2) for level in levels],
+        bars(parameter_axes, levels + 0.006 * (index - 1), [estimate_rate(distance <= level / 2) for level in levels],
              color=style.CHAIN_COLOURS[3 + index], marker=MARKERS[index], label=f"log {name}")
     style.tidy(path_axes, xlabel="parameters of the smoother", ylabel="coverage of the 95% bands")
     path_axes.set_xticks(range(len(smoothers)), list(smoothers))
     style.tidy(parameter_axes, xlabel="probability of the posterior interval", ylabel="intervals that hold the truth")
     parameter_axes.legend(loc="lower right")
     style.legend_above(figure, [
-        *(line(path, COLOURS[index], "", marker=MARKERS[index], ms=3.0) for index, path in enumerate(TARGETS.paths)),
+        *(line(path, COLOURS[index], "", marker=MARKERS[index], ms=3.0) for index, path in enumerate(PATHS)),
         line("nominal", style.BLACK, lw=0.8), patch("93% to 97%", SPAN)])
     style.note_below(figure, f"{estimates.sizes['dataset']} targets; error bars are two standard errors.")
     return figure

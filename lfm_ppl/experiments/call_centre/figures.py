@@ -15,7 +15,7 @@ from lfm_ppl.experiments.call_centre.problem import GRID, TEST_RATES, TRAINING_D
 from lfm_ppl.experiments.call_centre.tracking import QueueEstimate, customers
 from lfm_ppl.experiments.datasets import select_prefix
 from lfm_ppl.experiments.drawing import TRUTH, band, legend, line, patch
-from lfm_ppl.experiments.scores import Z, mean_of
+from lfm_ppl.experiments.scores import Z, estimate_mean
 from lfm_ppl.experiments.study import Data
 from lfm_ppl.results.plots import style
 
@@ -121,7 +121,7 @@ def plot_errors(data: Data, *, width: str | float = "full") -> Figure:
             axes.semilogy(np.full(days.rmse.size, x), days.rmse, ls="", marker=".", ms=4, mew=0.6, **properties)
             axes.semilogy([x - 0.3, x + 0.3], [days.rmse.mean()] * 2, color=colour, lw=1.5)
             axes.set(title=f"{test} service rate", ylabel="RMSE of the queue (customers)")
-            share = mean_of(days.coverage)
+            share = estimate_mean(days.coverage)
             coverage.errorbar(x + shift, share.value, share.error, marker=marker, ms=3.5, lw=0.8, mew=0.8,
                               **properties)
     coverage.axhspan(0.9, 0.98, color=style.GREY, alpha=0.15, lw=0)

@@ -51,11 +51,12 @@ def run_searches(arrival_model: ArrivalModel, y: np.ndarray, prior: float = 0.0)
     """
     objective = problem.posterior(arrival_model).objective(y, prior)
     bounds, *starts = (np.log([values[name] for name in arrival_model.names]) for values in (LIMITS, *STARTS))
-    ends = [quasi_newton(objective, start, bounds=bounds, options=_SEARCH) for start in starts]
-    if not any(np.isfinite(end.value) for end in ends):
+    end_points = [quasi_newton(objective, start, bounds=bounds, options=_SEARCH) for start in starts]
+    finite = [end for end in end_points if np.isfinite(end.value)]
+    if not finite:
         raise ValueError(f"the likelihood is not finite at any start of the searches for {arrival_model.force}; check "
                          "the counts for values that no queue can reach.")
-    return sorted((end for end in ends if np.isfinite(end.value)), key=lambda end: end.value), objective.evaluations
+    return sorted(finite, key=lambda end: end.value), objective.evaluations
 
 
 def sample_posterior(arrival_model: ArrivalModel, y: np.ndarray, count: int, seed: int) -> Weighted:
@@ -68,11 +69,11 @@ def find_modes(arrival_model: ArrivalModel, y: np.ndarray) -> list[Minimum]:
 
     A lower mode without a positive definite curvature is dropped: it lies at a bound, or its search did not converge.
     """
-    ends, _ = run_searches(arrival_model, y, prior=1.0)
+    end_points, _ = run_searches(arrival_model, y, prior=1.0)
     objective = problem.posterior(arrival_model).objective(y)
     distinct: list[End] = []
-    for end in ends:
-        is_high = end.value - ends[0].value < MODE_GAP
+    for end in end_points:
+        is_high = end.value - end_points[0].value < MODE_GAP
         if is_high and all(np.abs(end.point - mode.point).max() > MODE_TOLERANCE for mode in distinct):
             distinct.append(end)
 

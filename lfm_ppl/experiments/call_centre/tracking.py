@@ -117,12 +117,12 @@ def score_mixture(estimates: Sequence[QueueEstimate], window: CallWindow, test: 
             "rate_coverage": scores.interval_coverage(rate_low, rate_high, arrivals)}
 
 
-def arrival_model_of(task: Task) -> ArrivalModel:
+def build_arrival_model(task: Task) -> ArrivalModel:
     """Return the model of the arrivals for a task."""
     return ArrivalModel(task.settings["method"].lower(), task.settings["link"], task.settings["functions"])
 
 
-def windows_of(task: Task) -> list[CallWindow]:
+def build_windows(task: Task) -> list[CallWindow]:
     """Return the windows of a task."""
     data, weekday = task.settings["data"], task.settings["weekday"]
     return [problem.build_window(data, weekday, index, task.seed) for index in dataset_indices(task)]
@@ -136,7 +136,7 @@ def track_most_likely(task: Task) -> Result:
         the longest true queue; CPU ``seconds``, for the first window with compilation; and the entries of
         `QueueEstimate` for the first window, with the prefix ``{test}_``.
     """
-    arrival_model, windows, rows = arrival_model_of(task), windows_of(task), []
+    arrival_model, windows, rows = build_arrival_model(task), build_windows(task), []
     for window in windows:
         start = time.process_time()
         (best, *_), evaluations = run_searches(arrival_model, window.training)
@@ -159,7 +159,7 @@ def track_marginalised(task: Task) -> Result:
         (N, P), and the entries of `score_draws`; for the first window the smoothed arrivals ``shapes`` and
         ``shapes_sd`` (673,) at the most likely parameters.
     """
-    arrival_model, windows, rows = arrival_model_of(task), windows_of(task), []
+    arrival_model, windows, rows = build_arrival_model(task), build_windows(task), []
     for seed, window in enumerate(windows, task.seed):
         weighted = sample_posterior(arrival_model, window.training, task.settings["draws"], seed)
         draws = weighted.resampled(task.settings["mixed"], seed)
@@ -172,7 +172,7 @@ def track_marginalised(task: Task) -> Result:
 
 def track_by_nuts(task: Task) -> Result:
     """Return the entries of `score_draws` and of `chains.sample` for one window."""
-    arrival_model, (window,) = arrival_model_of(task), windows_of(task)
+    arrival_model, (window,) = build_arrival_model(task), build_windows(task)
     count, warmup, draws = task.settings["chains"]
 
     def model(y: np.ndarray) -> None:

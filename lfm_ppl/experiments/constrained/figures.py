@@ -1,4 +1,4 @@
-"""Forces with their estimates and bands, errors, a target's paths, and the TRH of a patient."""
+"""Figures of the study: forces with estimates and bands, errors, a target's paths, and a patient's TRH."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from lfm_ppl.experiments.constrained import problem
-from lfm_ppl.experiments.constrained.estimators import BANDS, FULL, HORIZON, METHODS, NEAR
+from lfm_ppl.experiments.constrained.estimators import BANDS, FULL, HORIZON, MAX_PEAK_ERROR, METHODS
 from lfm_ppl.experiments.drawing import SHADE, TRUTH, legend
 from lfm_ppl.experiments.study import Data
 from lfm_ppl.results.plots import style
@@ -23,7 +23,7 @@ def draw(settings: Any, data: Data) -> dict[str, Figure]:
 
 @style.styled
 def plot_forces(data: Data, *, width: str | float = "column") -> Figure:
-    """Draw the first force of each shape, as the source's estimator and full information see it, with its band."""
+    """Draw the first force of each shape, its band, and its estimates by the source and by full information."""
     shapes, rows = data["transcription"]["shape"].values, problem.TIMES[:: METHODS[BANDS].every]
     figure = style.new_figure(width, 1.25 * len(shapes) + 0.6)
     panels = figure.subplots(len(shapes), 1, sharex=True, squeeze=False)[:, 0]
@@ -43,7 +43,7 @@ def plot_forces(data: Data, *, width: str | float = "column") -> Figure:
 
 @style.styled
 def plot_errors(data: Data, *, width: str | float = "column") -> Figure:
-    """Draw the mean squared errors of the force of all records, beside the published ones."""
+    """Draw the mean squared errors of the force of all records, and the published ones."""
     errors = data["transcription"]["mse"].transpose("method", ...)
     figure = style.new_figure(width, 2.6)
     axes = figure.subplots()
@@ -70,9 +70,9 @@ def plot_target(data: Data, *, width: str | float = "column") -> Figure:
     figure, panels = style.small_multiples(width, 3, 1.1)
     scales = ((1e-3, "km"), (1e-3, "km/s"), (1.0, "m/s^2"))
     for axes, path, (factor, unit) in zip(panels, problem.TARGET_PATHS, scales, strict=True):
-        found = factor * data["ballistic"][["estimate", "truth"]].sel(path=path)
-        axes.plot(problem.TARGET_TIMES, found["estimate"], color=style.BLUE, label=FULL)
-        axes.plot(problem.TARGET_TIMES, found["truth"], **TRUTH)
+        paths = factor * data["ballistic"][["estimate", "truth"]].sel(path=path)
+        axes.plot(problem.TARGET_TIMES, paths["estimate"], color=style.BLUE, label=FULL)
+        axes.plot(problem.TARGET_TIMES, paths["truth"], **TRUTH)
         axes.set_ylabel(style.with_unit(path, unit))
     style.label_time(panels, "s")
     legend(figure)
@@ -82,16 +82,16 @@ def plot_target(data: Data, *, width: str | float = "column") -> Figure:
 @style.styled
 def plot_patient(data: Data, *, width: str | float = "column") -> Figure:
     """Draw the first patient's concentrations, and TRH with its estimate and 95% band."""
-    found, units = data["thyroid"].isel(dataset=0), problem.thyroid().units
+    patient, units = data["thyroid"].isel(dataset=0), problem.thyroid().units
     figure = style.new_figure(width, 4.2)
     *panels, trh = figure.subplots(4, 1, sharex=True, height_ratios=(1, 1, 1, 2))
-    for axes, name, values in zip(panels, problem.thyroid().outputs or (), found["y"].T, strict=False):
-        axes.plot(found["measured"], values, color=style.VERMILLION, marker="o", ms=2.0, ls="", label="measured")
+    for axes, name, values in zip(panels, problem.thyroid().outputs or (), patient["y"].T, strict=False):
+        axes.plot(patient["measured"], values, color=style.VERMILLION, marker="o", ms=2.0, ls="", label="measured")
         style.tidy(axes, ylabel=style.with_unit(name, units[name]))
         axes.tick_params(labelbottom=False)
-    trh.fill_between(found["times"], found["low"], found["high"], color=SHADE, lw=0, label="95% band (EP)")
-    trh.plot(found["times"], found["mode"], color=style.BLUE, label=FULL)
-    trh.plot(found["times"], found["truth"], **TRUTH)
+    trh.fill_between(patient["times"], patient["low"], patient["high"], color=SHADE, lw=0, label="95% band (EP)")
+    trh.plot(patient["times"], patient["mode"], color=style.BLUE, label=FULL)
+    trh.plot(patient["times"], patient["truth"], **TRUTH)
     style.tidy(trh, xlabel="time of day (h)", ylabel=style.with_unit(problem.HORMONE, units[problem.HORMONE]),
                xlim=(0.0, 24.0), ylim=(0.0, None))
     legend(figure)
@@ -100,15 +100,15 @@ def plot_patient(data: Data, *, width: str | float = "column") -> Figure:
 
 @style.styled
 def plot_peaks(data: Data, *, width: str | float = "column") -> Figure:
-    """Draw by how much the times of the greatest TRH, and of the peak of its daily wave, are off."""
+    """Draw the distribution of errors of the time of greatest TRH, and of the peak of its daily wave."""
     errors = np.sort(data["thyroid"]["peak"].values, axis=0)
     share = np.arange(len(errors) + 1) / len(errors)
     figure = style.new_figure(width, 2.0)
     axes = figure.subplots()
     kinds = ((style.ORANGE, "--", "greatest TRH"), (style.BLUE, "-", "peak of the wave of 24 h"))
-    for own, (colour, line, label) in zip(errors.T, kinds, strict=True):
-        axes.step(np.append(0.0, own), share, where="post", color=colour, ls=line, label=label)
-    axes.axvline(NEAR, color=style.BLACK, lw=0.6)
+    for event_errors, (colour, line, label) in zip(errors.T, kinds, strict=True):
+        axes.step(np.append(0.0, event_errors), share, where="post", color=colour, ls=line, label=label)
+    axes.axvline(MAX_PEAK_ERROR, color=style.BLACK, lw=0.6)
     axes.axhline(0.9, color=style.BLACK, lw=0.6)
     style.tidy(axes, xlim=(0.0, 3.0), ylim=(0.0, 1.02), xlabel="error of the time (h)", ylabel="share of patients")
     legend(figure)

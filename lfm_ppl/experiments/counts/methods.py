@@ -44,7 +44,7 @@ REPEATS, PREDICTIVE_DRAWS = 5, 4000
 
 def learn_parameters(task: Task) -> Result:
     """Return the parameters at the mode of the posterior with the evidence of EP, or the true parameters."""
-    problem = _problem_of(task)
+    problem = _build_task_problem(task)
     if problem.true_parameters is not None:
         return dict(problem.true_parameters)
     mode = map_estimate(problem.model, problem.times, problem.y, restarts=1)
@@ -63,10 +63,10 @@ def apply_method(task: Task) -> Result:
         ``ess`` and the largest ``r_hat`` over 40 rows.
     """
     method = _apply_reference if task.settings["method"] == REFERENCE else _apply_sites
-    return method(task, _problem_of(task), dict(task.settings["parameters"]))
+    return method(task, _build_task_problem(task), dict(task.settings["parameters"]))
 
 
-def _problem_of(task: Task) -> CountsProblem:
+def _build_task_problem(task: Task) -> CountsProblem:
     settings = task.settings
     return build_problem(settings["problem"], ProblemSize(*settings["size"]), task.seed, settings["data"])
 

@@ -81,7 +81,7 @@ def all_tasks(settings: GinzburgLandauSettings) -> list[Task]:
     for label, (kernel, _) in parameters.SAMPLERS.items():
         size = dict(zip(LENGTHS, (parameters.CHAINS, *getattr(settings, kernel.lower())), strict=True))
         tasks += factory.dataset_tasks(f"mcmc/{slug(label)}", count, sampler=label, paths=settings.paths, **size,
-                                     **kernels[kernel])
+                                       **kernels[kernel])
     return sort_by_dataset(tasks)
 
 
@@ -99,8 +99,8 @@ def comparison_rows(data: Data) -> dict[str, Any]:
 
     Scores of paths are the RMSE of filter and smoother over the fine times, and the share of these times at which the
     95% band contains the path. Scores of MCMC are the coverage of 95% intervals (all three parameters pooled), the
-    smallest bulk effective sample size per CPU second of warm-up and draws, and the largest R-hat. CPU seconds are
-    those of all threads for one realisation, without compilation.
+    smallest bulk effective sample size per CPU second of warm-up and draws, and the largest R-hat. CPU seconds
+    are summed over all threads for one realisation, without compilation.
     """
     smoother: dict[str, Column] = {"RMSE smoother": "smoother_rmse", "coverage smoother": "smoother_coverage"}
     empty = dict.fromkeys(("coverage parameters", "ESS/CPU s"), lambda realisations: Estimate(np.nan, np.nan))

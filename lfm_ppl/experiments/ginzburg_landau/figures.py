@@ -15,7 +15,7 @@ from scipy import stats
 from lfm_ppl.experiments.datasets import select_prefix
 from lfm_ppl.experiments.drawing import SHADE, SPAN, bars, legend
 from lfm_ppl.experiments.ginzburg_landau import parameters, problem
-from lfm_ppl.experiments.scores import GridPosterior, Z, rate_of
+from lfm_ppl.experiments.scores import GridPosterior, Z, estimate_rate
 from lfm_ppl.experiments.study import Data
 from lfm_ppl.results.plots import style
 
@@ -132,7 +132,7 @@ def plot_rates(data: Data, *, width: str | float = "full") -> Figure:
     axes, positions = figure.subplots(), np.arange(len(problem.NAMES) + 1)
     for number, (method, method_outcomes) in enumerate(zip(is_outside.method.values, is_outside, strict=True)):
         by_parameter = method_outcomes.transpose("parameter", "dataset")
-        shares = [*map(rate_of, by_parameter), parameters.pooled_rate(method_outcomes)]
+        shares = [*map(estimate_rate, by_parameter), parameters.pooled_rate(method_outcomes)]
         x = positions + 0.15 * (number - (len(is_outside) - 1) / 2)
         axes.bar(x, [share.value for share in shares], 0.13, color=COLOURS[method], label=method, zorder=2)
         bars(axes, x, shares, times=1.0, fmt="none", ecolor=style.BLACK, elinewidth=0.7, zorder=3)

@@ -99,7 +99,7 @@ def _compile_likelihoods(method: str, size: int, steps: int, times: tuple[float,
         ssm = state_space(system)
         time_grid = build_time_grid(ssm, np.array(times), steps)
         if method == problem.GRID:
-            return grid_filter.log_likelihood(ssm, time_grid, y, states.cells_of(size))
+            return grid_filter.log_likelihood(ssm, time_grid, y, states.build_grid(size))
         settings = particle_filter.check_settings(ssm, particle_filter.ParticleSettings(size))
         return particle_filter.log_likelihood(ssm, time_grid, y, key, settings)
 
@@ -135,7 +135,7 @@ def outcomes(dataset: xr.Dataset) -> xr.Dataset:
     below, cut = xr.zeros_like(rows[..., 0]), xr.zeros_like(rows[..., 0], bool)
     for cell in np.ndindex(below.shape):
         posterior = scores.GridPosterior(nodes(problem.NAMES[cell[-1]], rows.sizes["node"]), rows.values[cell])
-        below[cell], cut[cell] = posterior.below(problem.TRUTH[cell[-1]]), posterior.is_cut_off()
+        below[cell], cut[cell] = posterior.cdf(problem.TRUTH[cell[-1]]), posterior.is_cut_off()
     return xr.Dataset({"below": below, "outside": (below < OUTSIDE / 2) | (below > 1 - OUTSIDE / 2), "cut": cut,
                        "seconds": dataset.seconds.sum("first") / rows.sizes["dataset"]})
 
@@ -145,9 +145,9 @@ def pooled_rate(is_outside: xr.DataArray) -> scores.Estimate:
 
     The standard error is that of the mean over realisations, since only realisations are independent.
     """
-    share = scores.mean_of(is_outside.mean("parameter"))
+    share = scores.estimate_mean(is_outside.mean("parameter"))
     spread = is_outside.any() and is_outside.sizes["dataset"] > 1
-    return share if spread else scores.Estimate(share.value, scores.rate_of(is_outside).error)
+    return share if spread else scores.Estimate(share.value, scores.estimate_rate(is_outside).error)
 
 
 def sample_posterior(task: Task) -> Result:
@@ -170,7 +170,7 @@ def sample_posterior(task: Task) -> Result:
     draws = np.asarray(draws)
     mean, variance = map(np.asarray, _smooth_at_draws(
         scores.thin_draws(draws, settings["paths"]), data.sparse, SAMPLERS[settings["sampler"]][1],
-        states.size_of(settings, data), tuple(data.fine)))
+        states.solver_size(settings, data), tuple(data.fine)))
     paths = states.band("smoother", *scores.total_moments(mean, variance))
     return {"draws": draws, "divergences": int(divergences), "seconds": seconds,
             **scores.diagnose(problem.NAMES, draws), **paths, **states.score_path("smoother", paths, data.path)}
@@ -203,7 +203,7 @@ def _compile_chains(label: str, lengths: tuple[int, ...], steps: Any, particles:
         # One loop for warm-up and draws, which the kernel distinguishes, compiles the likelihood only once.
         start = kernel.init(key, warmup * thin, None, arguments, {})
         _, records = jax.lax.scan(step, start, length=warmup + draws)
-        z, diverging = jax.tree_util.tree_map(lambda a: a[warmup:], records)
+        z, diverging = jax.tree.map(lambda a: a[warmup:], records)
         sites = jax.vmap(kernel.postprocess_fn(arguments, {}))(z)
         return jnp.stack([sites[name] for name in problem.NAMES]), diverging.sum()
 

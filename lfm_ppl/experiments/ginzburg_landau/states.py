@@ -1,4 +1,11 @@
-"""Filtering and smoothing at the true parameters, by every method; the exact solution on a grid."""
+"""Filtering and smoothing at the true parameters by every method.
+
+1. Gaussian methods filter and smooth on the fine times, with missing observations between the data.
+2. The grid discretises the state by finite volumes. Forward and backward passes with its transition matrix give the
+   exact densities, up to the error of discretisation.
+3. Particles filter with steps of strong order 1.5, and smooth by drawing trajectories.
+4. All results become means, 95% bands, RMSE and coverage; the grid adds densities at three times.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +37,7 @@ third time, at which the filtering density is most bimodal."""
 PARTICLE_STEPS = {"steps": 2, "smoother_steps": 4}
 """Steps of the particles between two fine times: of strong order 1.5 in the filter, Euler's in the smoother."""
 
-cells_of = functools.partial(Grid, -12.0, 12.0)
+build_grid = functools.partial(Grid, -12.0, 12.0)
 """Grid with a given number of cells. At the truth, paths of 50 units of time stay between -7.5 and 7.5. Against 1600
 cells on (-16, 16), the log likelihood of 26 observations with 400 cells has an error of 0.002 at the truth, and of less
 than 0.06 wherever a conditional posterior has mass."""
@@ -63,7 +70,7 @@ def band(prefix: str, mean: Any, sd: Any) -> Result:
     return {f"{prefix}_mean": np.asarray(mean), f"{prefix}_low": low, f"{prefix}_high": high}
 
 
-def size_of(settings: Any, data: problem.Realisation) -> int:
+def solver_size(settings: Any, data: problem.Realisation) -> int:
     """Return the number of grid cells, or of integration steps between two fine times."""
     return settings.get("cells") or max(1, round(settings["steps"] * (len(data.times) - 1) / (len(data.fine) - 1)))
 
@@ -88,7 +95,7 @@ def solve(method: str, theta: jax.Array, sparse: jax.Array, fine: np.ndarray, si
         smoothed = smooth(system, fine, sparse, problem.GAUSSIAN[method], size)
         return (smoothed.log_likelihood.sum(), (filtered.filtered_mean[:, 0], filtered.filtered_covariance[:, 0, 0]),
                 (smoothed.mean[:, 0], smoothed.covariance[:, 0, 0]), ())
-    ssm, cells = state_space(system), cells_of(size)
+    ssm, cells = state_space(system), build_grid(size)
     time_grid = build_time_grid(ssm, fine, 1)
     transition = grid_filter.build_transition(grid_filter.on_grid(ssm, time_grid, cells), time_grid, 1)
     forward = grid_filter.forward(transition, time_grid, sparse[None], keep_masses=True)
@@ -100,16 +107,16 @@ def solve(method: str, theta: jax.Array, sparse: jax.Array, fine: np.ndarray, si
 
 
 def _solve(task: Task, data: problem.Realisation) -> Result:
-    method, size = task.settings["method"], size_of(task.settings, data)
+    method, size = task.settings["method"], solver_size(task.settings, data)
     solver = _compile_solver(method, size, tuple(data.fine))
     seconds, (log_likelihood, *moments, masses) = time_call(solver, data.sparse)
     result: Result = {"log_likelihood": float(log_likelihood), "seconds": seconds}
     for prefix, (mean, variance) in zip(("filter", "smoother"), moments, strict=True):
         result |= band(prefix, mean, np.sqrt(variance))
     if method == problem.GRID:
-        cells, filtered = cells_of(size), np.asarray(masses[0])
+        cells, filtered = build_grid(size), np.asarray(masses[0])
         is_distant = np.abs(data.fine[:, None] - np.asarray(MARKS)).min(axis=1) > APART
-        bimodal_index = np.flatnonzero(is_distant)[most_bimodal(filtered[is_distant])]
+        bimodal_index = np.flatnonzero(is_distant)[most_bimodal_index(filtered[is_distant])]
         mark_indices = np.append(np.searchsorted(data.fine, np.asarray(MARKS) - 1e-9), bimodal_index)
         result |= {"x": cells.centres, "marks": data.fine[mark_indices]}
         for prefix, mass in zip(("filter", "smoother"), map(np.asarray, masses), strict=True):
@@ -119,7 +126,7 @@ def _solve(task: Task, data: problem.Realisation) -> Result:
     return result
 
 
-def most_bimodal(densities: np.ndarray) -> int:
+def most_bimodal_index(densities: np.ndarray) -> int:
     """Return the index of the density (K, N) whose two highest modes have the deepest valley between them.
 
     The depth is the difference between the lower mode and the valley, relative to the higher mode.
@@ -127,7 +134,7 @@ def most_bimodal(densities: np.ndarray) -> int:
     Example:
         >>> x = np.linspace(-4.0, 4.0, 81)
         >>> hill = lambda mode: np.exp(-2.0 * (x - mode) ** 2)
-        >>> most_bimodal(np.stack([hill(0.0), hill(-2.0) + 0.5 * hill(2.0), hill(-2.0) + hill(2.0)]))
+        >>> most_bimodal_index(np.stack([hill(0.0), hill(-2.0) + 0.5 * hill(2.0), hill(-2.0) + hill(2.0)]))
         2
     """
     # Largest density on each side of every cell; a valley lies below the smaller of the two.

@@ -26,7 +26,7 @@ from lfm_ppl.experiments.datasets import TaskKind
 from lfm_ppl.experiments.gps import figures, learning_methods, problem, satellite
 from lfm_ppl.experiments.gps.figures import METRE, rms
 from lfm_ppl.experiments.gps.satellite import REFUSED, compute_or_refuse
-from lfm_ppl.experiments.scores import estimate_cells, mean_of
+from lfm_ppl.experiments.scores import estimate_cells, estimate_mean
 from lfm_ppl.experiments.study import Data, Results, Study, StudyTable, setting
 from lfm_ppl.orbits import learning, magnitudes
 from lfm_ppl.orbits.arc import NOISE, Unusable
@@ -153,11 +153,11 @@ def tables(settings: GpsSettings, data: Data) -> dict[str, StudyTable]:
     """Return the tables."""
     table = satellite_table(data)
     result = {"pooled": StudyTable.from_rows("Errors after training (m), pooled over satellites, and 95% coverage",
-                                            pooled_rows(data["predict"], table)),
-             "satellites": StudyTable(
+                                             pooled_rows(data["predict"], table)),
+              "satellites": StudyTable(
                  "Each satellite: root mean square errors after training (m)", table,
                  pd.DataFrame({name: table[name].map(text.format) for name, text in _PRINTED.items()})),
-             "magnitudes": StudyTable("", magnitude_table(data))}
+              "magnitudes": StudyTable("", magnitude_table(data))}
     if "ways" in data:
         result["learning"] = StudyTable.from_rows(
             "Ways to learn the magnitudes of the forces: error after training (m)",
@@ -209,7 +209,7 @@ def _pool_errors(table: pd.DataFrame) -> dict[str, Any]:
     return {"satellites": len(table), "fit, median": table["fit"].median(), **errors, "median": table["LFM"].median(),
             "ratio": errors["LFM"] / errors["deterministic"], "ratio, latest": errors["LFM"] / errors["latest state"],
             "improved": int((table["LFM"] < table["deterministic"]).sum()),
-            **estimate_cells("coverage", mean_of(table["coverage"]))}
+            **estimate_cells("coverage", estimate_mean(table["coverage"]))}
 
 
 def magnitude_table(data: Data) -> pd.DataFrame:

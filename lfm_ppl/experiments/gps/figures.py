@@ -27,7 +27,7 @@ def draw(settings: Any, data: Data) -> dict[str, Figure]:
     predicted, online = data["predict"], data.get("online")
     systems = list(dict.fromkeys(predicted.system.values))
     figures = {"all" if len(systems) == 1 else f"all-{system}":
-             plot_all(predicted.isel(satellite=(predicted.system == system).values)) for system in systems}
+               plot_all(predicted.isel(satellite=(predicted.system == system).values)) for system in systems}
     name = (predicted if online is None else online).satellite.values[0]
     satellite = predicted.sel(satellite=name)
     figures |= {f"errors-{name}": plot_errors(satellite), f"forces-{name}": plot_forces(satellite)}
@@ -62,7 +62,7 @@ def plot_errors(satellite: xr.Dataset, *, width: str | float = "full") -> Figure
     """Draw the errors of a satellite's position along the radial, tangential and normal directions."""
     figure, panels = style.small_multiples(width, 3, 1.7)
     lines = {"fitted": _FITTED, "latest": _LATEST | {"ls": "--"}, "lfm": _MODEL}
-    _errors(panels, satellite, ("radial", "tangential", "normal"), lines)
+    _draw_errors(panels, satellite, ("radial", "tangential", "normal"), lines)
     for axes in panels:
         axes.axvline(satellite.times[int(satellite.train)] / 24.0, **_END)
     legend(figure)
@@ -77,13 +77,13 @@ def plot_online(satellite: xr.Dataset, *, width: str | float = "full") -> Figure
         axes.fill_between(satellite.times / 24.0, 0, 1, where=satellite.observed, color=_SEEN, alpha=0.2, lw=0,
                           transform=axes.get_xaxis_transform())
     lines = {"restarted": _LATEST | {"ls": "--"}, "lfm": _MODEL}
-    _errors(panels, satellite, "xyz", lines, first=int(satellite.observed.argmin("time")))
+    _draw_errors(panels, satellite, "xyz", lines, first=int(satellite.observed.argmin("time")))
     legend(figure, patch("positions observed", _SEEN, alpha=0.2))
     return figure
 
 
-def _errors(panels: Sequence[Axes], satellite: xr.Dataset, directions: Sequence[str],
-            lines: Mapping[str, dict[str, Any]], first: int = 0) -> None:
+def _draw_errors(panels: Sequence[Axes], satellite: xr.Dataset, directions: Sequence[str],
+                 lines: Mapping[str, dict[str, Any]], first: int = 0) -> None:
     """Draw errors, and the model's band about zero; the axis limits fit the errors after epoch ``first``."""
     days = satellite.times / 24.0
     for index, (axes, direction) in enumerate(zip(panels, directions, strict=True)):

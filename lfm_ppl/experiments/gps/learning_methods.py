@@ -27,7 +27,7 @@ from lfm_ppl.orbits.training import Regression, Training
 from lfm_ppl.parallel.task import Result, Task
 
 METHODS = ("held out, averaged", "held out, mode", "marginal likelihood, mode", "marginal likelihood, posterior",
-        "smoothed forces, mode")
+           "smoothed forces, mode")
 _WARMUP, _SAMPLES = 1_000, 1_000
 
 

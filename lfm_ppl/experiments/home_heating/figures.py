@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from lfm_ppl.experiments.datasets import select_prefix
 from lfm_ppl.experiments.drawing import TRUTH, band, bars, legend, line
 from lfm_ppl.experiments.home_heating import prediction, problem
-from lfm_ppl.experiments.scores import mean_of
+from lfm_ppl.experiments.scores import estimate_mean
 from lfm_ppl.experiments.study import Data
 from lfm_ppl.results.plots import style
 
@@ -43,7 +43,7 @@ def plot_homes(settings: Any, data: Data, *, store: str | None = None, width: st
     assert window.fine is not None and window.set_points is not None
     hours, set_points = problem.FINE[prediction.SCORED] - problem.TRAIN, window.set_points[problem.TRAIN:]
     truth, _, heater = window.fine[prediction.SCORED].T
-    figure, panels = _panels(width, data["homes"].sel(store=store).isel(dataset=0), "heater on")
+    figure, panels = _build_panels(width, data["homes"].sel(store=store).isel(dataset=0), "heater on")
     for residual, upper, lower in panels:
         low, quarter, middle, upper_quarter, high = residual.quantiles
         upper.plot(hours, middle, color=style.BLUE, label="predicted")
@@ -66,7 +66,7 @@ def plot_house(settings: Any, data: Data, *, store: str | None = None, width: st
     index = house.sizes["dataset"] // 2
     temperature, _, power = problem.house(settings.data)[index].y[problem.TRAIN:].T
     house = house.isel(dataset=index)
-    figure, panels = _panels(width, house.assign(select_prefix(house, "ahead")), "power")
+    figure, panels = _build_panels(width, house.assign(select_prefix(house, "ahead")), "power")
     for residual, upper, lower in panels:
         upper.plot(hours, residual["mean"], color=style.BLUE, label="predicted")
         band(upper, hours, residual["mean"], residual["sd"], color=_WIDE)
@@ -78,8 +78,8 @@ def plot_house(settings: Any, data: Data, *, store: str | None = None, width: st
     return figure
 
 
-def _panels(width: str | float, dataset: xr.Dataset,
-            heating: str) -> tuple[Figure, list[tuple[xr.Dataset, Axes, Axes]]]:
+def _build_panels(width: str | float, dataset: xr.Dataset,
+                  heating: str) -> tuple[Figure, list[tuple[xr.Dataset, Axes, Axes]]]:
     """Return a figure, and for each residual in it the results and the axes of temperature and heating."""
     methods = [method for method in _FIGURE_METHODS if method in dataset.method] or list(dataset.method.values)
     columns = min(3, len(methods))
@@ -137,7 +137,7 @@ def plot_scores(data: Data, *, width: str | float = "full") -> Figure:
     for (title, dataset), (rmse_axes, ell_axes) in zip(kinds.items(), grid, strict=True):
         for index, store in enumerate(stores):
             store_scores, x = dataset.sel(store=store), positions + 0.16 * (index - 0.5)
-            bars(rmse_axes, x, [mean_of(errors) for errors in store_scores.rmse], **_MARKS[store])
+            bars(rmse_axes, x, [estimate_mean(errors) for errors in store_scores.rmse], **_MARKS[store])
             low, middle, high = store_scores.ell.quantile([0.25, 0.5, 0.75], "dataset", skipna=False).values
             ell_axes.errorbar(x, middle, [middle - low, high - middle], ls="", ms=3.0, elinewidth=0.8, capsize=1.5,
                               **_MARKS[store])

@@ -1,12 +1,12 @@
 """Learning from four days of a home, and predictions of the fifth day.
 
-1. Find the most likely parameters, in logarithms z, given four days of temperatures and heater (`most_likely`), or
+1. Find the most likely parameters, in logarithms z, given four days of temperatures and heater (`find_mode`), or
    sample their posterior (`posterior`).
 2. In the real house the heater of the fifth day is known. Filter the five days with the fifth day's indoor temperatures
-   hidden; their predictive moments give the scores (`known_heater`).
+   hidden; their predictive moments give the scores (`predict_with_known_heater`).
 3. In a simulated home the heater follows a thermostat. Start a Rao-Blackwellised particle filter at the last
-   measurement, and predict temperatures and heater jointly (`thermostat_ahead`).
-4. With the posterior, average the predictive densities over its draws (`_posterior`).
+   measurement, and predict temperatures and heater jointly (`predict_under_thermostat`).
+4. With the posterior, average the predictive densities over its draws (`_compute_posterior`).
 """
 
 from __future__ import annotations
@@ -50,48 +50,48 @@ SCORED, AHEAD, TRACKED = FINE >= TRAIN, TIMES >= TRAIN, (TIMES > TRAIN) & (TIMES
 def compute(task: Task) -> Result:
     """Return the result of a task, with its CPU time ``cpu_s``."""
     model = Model(*(task.settings[name] for name in Model._fields))
-    run = {"house": _house, "homes": _homes, "posterior": _posterior}[task.name.split("/")[0]]
+    run = {"house": _compute_house, "homes": _compute_homes, "posterior": _compute_posterior}[task.name.split("/")[0]]
     seconds, result = timing.time_call(run, task, model)
     return {**result, "cpu_s": seconds}
 
 
-def _windows(task: Task, model: Model) -> Iterator[tuple[Window, np.ndarray, float]]:
+def _find_modes(task: Task, model: Model) -> Iterator[tuple[Window, np.ndarray, float]]:
     """Yield every window with its most likely parameters and their log density; each search starts at the last mode."""
     z = None
     for window in problem.house(task.settings["data"])[:task.settings["windows"]]:
-        z, density = most_likely(model, window, z)
+        z, density = find_mode(model, window, z)
         yield window, z, density
 
 
-def _house(task: Task, model: Model) -> Result:
+def _compute_house(task: Task, model: Model) -> Result:
     """Return scores and paths of every window, and the residual (120,) of the window in the figure."""
     rows, residual = [], {}
-    for index, (window, z, density) in enumerate(_windows(task, model)):
-        rows.append({**known_heater(model, window, z), "z": z, "density": density})
+    for index, (window, z, density) in enumerate(_find_modes(task, model)):
+        rows.append({**predict_with_known_heater(model, window, z), "z": z, "density": density})
         if index == task.settings["shown"] and model.method in RESIDUALS:
             mean, sd = smooth_residual(model, z, mask_fifth_day(window.y), window.outdoor)
             residual = {"residual": np.asarray(mean), "residual_sd": np.asarray(sd)}
     return stack_results(rows) | residual
 
 
-def _homes(task: Task, model: Model) -> Result:
+def _compute_homes(task: Task, model: Model) -> Result:
     """Return scores and paths of every simulated home, and quantiles (5, 144) of the first."""
     rows = []
     for index in range(task.settings["homes"]):
         window = problem.home(index, model.store, task.seed)
-        z, _ = most_likely(model, window)
+        z, _ = find_mode(model, window)
         key = jax.random.fold_in(task.key, index)
-        result, prediction = thermostat_ahead(model, window, z, task.settings["particles"], key)
+        result, prediction = predict_under_thermostat(model, window, z, task.settings["particles"], key)
         rows.append({**result, "z": z})
         if index == 0:
             rows[0]["quantiles"] = np.asarray(prediction.observed.quantiles(QUANTILES))[:, SCORED, 0]
     return stack_results(rows, first_only=("quantiles",))
 
 
-def _posterior(task: Task, model: Model) -> Result:
+def _compute_posterior(task: Task, model: Model) -> Result:
     """Return scores of some windows with the most likely parameters and with their posterior."""
     rows = []
-    for index, (window, z, _) in enumerate(_windows(task, model)):
+    for index, (window, z, _) in enumerate(_find_modes(task, model)):
         if index % task.settings["every"]:
             continue
         sampled = posterior(task.settings["sampler"], model, window, z, jax.random.fold_in(task.key, index),
@@ -99,7 +99,7 @@ def _posterior(task: Task, model: Model) -> Result:
         draws = scores.thin_draws(sampled["draws"], 100)
         moments = filter_under_draws(model, draws, mask_fifth_day(window.y), window.outdoor)
         mean, variance = (np.asarray(moment)[:, AHEAD] for moment in moments[:2])
-        truth, point = window.y[AHEAD, 0], known_heater(model, window, z)
+        truth, point = window.y[AHEAD, 0], predict_with_known_heater(model, window, z)
         densities = logsumexp(norm.logpdf(truth, mean, np.sqrt(variance)), axis=0) - np.log(len(draws))
         rows.append({"ell": float(densities.sum()), "rmse": scores.rmse(mean.mean(axis=0), truth),
                      "point_ell": point["ahead_ell"], "point_rmse": point["ahead_rmse"],
@@ -108,7 +108,7 @@ def _posterior(task: Task, model: Model) -> Result:
     return stack_results(rows)
 
 
-def most_likely(model: Model, window: Window, start: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+def find_mode(model: Model, window: Window, start: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """Return the most likely logarithms z (P,) of the parameters given the first four days, and their log density.
 
     The priors are those in the model file, with standard deviations of 0.7 to 1 in the logarithm. Without priors some
@@ -188,8 +188,8 @@ def smooth_residual(model: Model, z: Any, y: Any, outdoor: dict[str, Any]) -> tu
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def under_thermostat(model: Model, particles: int, key: jax.Array, z: Any, window: Window, mean: jax.Array,
-                     covariance: jax.Array) -> RaoBlackwellisedResult:
+def run_thermostat(model: Model, particles: int, key: jax.Array, z: Any, window: Window, mean: jax.Array,
+                   covariance: jax.Array) -> RaoBlackwellisedResult:
     """Predict a window from the state and the heater at the last measurement to the end of the fifth day."""
     assert window.fine is not None
     values, outdoor = model.values(z, window.outdoor), jnp.asarray(window.fine)[:, 1]
@@ -199,7 +199,7 @@ def under_thermostat(model: Model, particles: int, key: jax.Array, z: Any, windo
         initial=window.on, start=FilterState(np.asarray(TRAIN - 1.0), mean, covariance), particles=particles, steps=1)
 
 
-def known_heater(model: Model, window: Window, z: np.ndarray) -> Result:
+def predict_with_known_heater(model: Model, window: Window, z: np.ndarray) -> Result:
     """Return scores and paths of the fifth day with a known heater.
 
     ``{kind}_rmse``, ``{kind}_ell`` and ``{kind}_inside`` are the scores of the day ahead ("ahead"), of a tracked day
@@ -224,8 +224,8 @@ def gaussian_scores(mean: np.ndarray, variance: np.ndarray, truth: np.ndarray) -
             "inside": scores.interval_coverage(*scores.interval(mean, sd), truth)}
 
 
-def thermostat_ahead(model: Model, window: Window, z: np.ndarray, particles: int,
-                     key: jax.Array) -> tuple[Result, RaoBlackwellisedResult]:
+def predict_under_thermostat(model: Model, window: Window, z: np.ndarray, particles: int,
+                             key: jax.Array) -> tuple[Result, RaoBlackwellisedResult]:
     """Return scores of the fifth day under the thermostat, every ten minutes, and the prediction.
 
     The outdoor temperature is known at every full hour.
@@ -236,7 +236,7 @@ def thermostat_ahead(model: Model, window: Window, z: np.ndarray, particles: int
     problem.thermostat(window.set_points)
     assert window.fine is not None
     state = filter_window(model, z, mask_fifth_day(window.y), window.outdoor)[2:]
-    forecast = under_thermostat(model, particles, key, z, window, *state)
+    forecast = run_thermostat(model, particles, key, z, window, *state)
     day: Mixture = jax.tree.map(lambda part: part[SCORED], forecast.observed)
     indoor, truth = Mixture(day.mean[:, :, :1], day.variance[:, :, :1], day.log_weights), window.fine[SCORED, :1]
     mean, z_scores = indoor.moments()[0], (truth[:, None] - indoor.mean) / jnp.sqrt(indoor.variance)

@@ -49,7 +49,7 @@ _POWER = 100.0
 
 _HOME = {"alpha": 0.1, "beta": 2.5, "scale": 0.3, "lengthscale": 0.5, "memory": 5.0, "noise_sd": 0.05,
          "outdoor_mean": 6.0, "outdoor_scale": 3.0, "outdoor_lengthscale": 10.0, "gamma": 0.05, "psi": 0.05}
-"""Parameters of the simulated home: those of the model file's default data, and of walls."""
+"""Parameters of the simulated home: the model file's values for its default data, and values for walls."""
 
 _VARIED = ("alpha", "beta", "scale", "gamma", "psi")
 _METER_ERROR, _FUNCTIONS = 1e-3, 15

@@ -11,7 +11,7 @@ from lfm_ppl.experiments import study
 from lfm_ppl.experiments.datasets import Column, TaskKind, row, rows
 from lfm_ppl.experiments.periodic_kernels import figures, methods, problem
 from lfm_ppl.experiments.periodic_kernels.methods import KPCA, SPARSE, SPARSE_4
-from lfm_ppl.experiments.scores import Estimate, estimate_cells, mean_of
+from lfm_ppl.experiments.scores import Estimate, estimate_cells, estimate_mean
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.parallel.task import Task
 
@@ -89,7 +89,7 @@ def published_rows(settings: PeriodicKernelSettings, data: Data) -> dict[str, An
     if settings.points[-1] >= 22:
         table[f"22 eigenfunctions, {settings.points[-1]} points"]["published"] = PUBLISHED[KPCA][0]
     for label, errors in ((SPARSE, quadrature["sparse 22"]), (SPARSE_4, quadrature["sparse 88"])):
-        table[label] = estimate_cells("error", mean_of(errors)) | {
+        table[label] = estimate_cells("error", estimate_mean(errors)) | {
             "least": float(errors.min()), "published": PUBLISHED[label][0]}
     return table
 

@@ -87,7 +87,7 @@ def plot_draws(settings: Any, *, width: str | float = "full") -> Figure:
     kernel = forces.PeriodicSquaredExponential(1.0, 1.0, problem.PERIOD)
     steps = forces.change_points(problem.PERIOD, 0.0, 60.0)
     evolutions = {"CQM, lengthscale 20": forces.CQM(20.0), "SQM, lengthscale 2": forces.SQM(2.0, steps),
-              "WQM, growth 0.5": forces.WQM(0.5, steps)}
+                  "WQM, growth 0.5": forces.WQM(0.5, steps)}
     t, generator = np.linspace(0.0, 60.0, 301), np.random.default_rng(settings.seed)
     figure = style.new_figure(width, 4.2)
     grid = figure.subplots(3, 2, sharex=True)

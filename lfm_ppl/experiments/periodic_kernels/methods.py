@@ -41,7 +41,7 @@ def covariance_errors(task: Task) -> Result:
     def errors(count: int) -> Result:
         force, size = eigenfunctions(kernel, count), max(1, count // 2)
         row = {EIGENFUNCTIONS: covariance_error(force, times, exact), RESONATORS: np.nan, RANDOM: np.nan,
-                 "left out": np.mean(np.diag(exact) - force.sde_covariance(times, times))}
+               "left out": np.mean(np.diag(exact) - force.sde_covariance(times, times))}
         if kernel.stationary:
             # Without noise and damping a resonator's covariance depends on the distance in time alone.
             covariance = forces.resonators(kernel, count, explained_variance=0.0).covariance(times)
@@ -64,7 +64,7 @@ def quadrature_errors(task: Task) -> Result:
     kernel = problem.window_kernel()
     times, exact = problem.covariance_on_grid(kernel)
     result = {"error": np.asarray([covariance_error(eigenfunctions(kernel, min(22, points), points), times, exact)
-                                  for points in task.settings["points"]])}
+                                   for points in task.settings["points"]])}
     for count in (22, 88):
         key = jax.random.fold_in(task.key, count)
         frequencies = np.stack([random_frequencies(jax.random.fold_in(key, index), problem.window_prior(), count)

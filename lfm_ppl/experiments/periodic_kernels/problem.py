@@ -26,7 +26,7 @@ PREDICTED = np.setdiff1d(np.arange(WINDOW), MEASURED)
 def kernels() -> dict[str, PeriodicCovariance]:
     """Return every kernel by name, all of scale one."""
     matern = {f"periodic Matern-{2 * order + 1}_2": forces.PeriodicMatern(1.0, 0.5, PERIOD, order)
-                for order in (2, 1, 0)}
+              for order in (2, 1, 0)}
     return {"periodic squared exponential": forces.PeriodicSquaredExponential(1.0, 0.5, PERIOD), **matern,
             "moderated periodic Matern-3_2": forces.ModeratedPeriodicMatern(1.0, 0.5, PERIOD, 0.3, 1),
             NOT_PERIODIC: window_kernel()}

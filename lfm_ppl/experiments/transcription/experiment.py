@@ -21,7 +21,7 @@ from scipy.stats import norm
 from lfm_ppl.experiments import published, scores, study
 from lfm_ppl.experiments.datasets import Column, TaskKind, cell, number, row
 from lfm_ppl.experiments.published import PublishedComparison
-from lfm_ppl.experiments.scores import mean_of
+from lfm_ppl.experiments.scores import estimate_mean
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import dataset_blocks, dataset_indices
 from lfm_ppl.experiments.transcription import approximations, figures, problem, slices
@@ -32,10 +32,10 @@ BLOCK = 10
 """Data sets of one task; a run with more data sets reuses all complete blocks."""
 
 TRUST = (
-    "Where elliptical slice sampling is lower than published it is trusted: it has the exact posterior of a linear "
-    "link and agrees with blackjax's independent elliptical slice sampler on five data sets (both are tests), and "
-    "chains whose R-hat is above 1.01 go on, up to five times as long (`mixed` and `ESS` say how that ended). This "
-    "says nothing of LA and GFS, which draw nothing.")
+    "Errors of elliptical slice sampling below the published ones are trusted: it samples the exact posterior of a "
+    "linear link and agrees with blackjax's independent elliptical slice sampler on five data sets (both are tests), "
+    "and chains with an R-hat above 1.01 continue, up to five times as long (see `mixed` and `ESS`). LA and GFS do not "
+    "sample, so that these reasons do not apply to them.")
 """Evidence that lower errors than published are correct."""
 
 _LABELS = tuple(entry.label for entry in problem.CONFIGURATIONS)
@@ -144,7 +144,7 @@ def published_rows(data: Data) -> dict[str, Any]:
         cells: dict[str, Any] = {"no mode": float((~at_mode).sum())}
         for method, (error, diverged) in problem.PUBLISHED[label].items():
             ours = dataset.sel({"method": method})
-            means = mean_of(ours.rmse), mean_of(ours.rmse[at_mode])
+            means = estimate_mean(ours.rmse), estimate_mean(ours.rmse[at_mode])
             z, z_at_modes = ((mean.value - error) / mean.error for mean in means)
             cells |= {**cell(method, ours.rmse), f"{method} published": error, f"{method} z": z,
                       f"{method} verdict": str(PublishedComparison(z)), f"{method} div.": float(ours.diverged.sum()),

@@ -112,28 +112,28 @@ def compute(task: Task) -> Result:
                             [samples[name] for name in LEVELS]])
     weights: Result = {}
     if sampler.iterations:
-        more, (draws, weights["k"]) = time_call(lambda: _weighted(settings, sampler.iterations, data, draws))
-        seconds += more
+        weighting_seconds, (draws, weights["k"]) = time_call(_resample_draws, settings, sampler.iterations, data, draws)
+        seconds += weighting_seconds
     if sampler.latent:
         forces = np.asarray(samples["y_forces"]).reshape(-1, len(FORCE_TIMES))
         mean, sd = forces.mean(axis=0), forces.std(axis=0)
     else:
-        mean, sd = _marginalised(settings, sampler.iterations, data, draws)
+        mean, sd = _marginalise_force(settings, sampler.iterations, data, draws)
     truth = np.interp(FORCE_TIMES, problem.GRID, data.u)
     return {"draws": draws, **weights, "divergences": int(np.sum(mcmc.get_extra_fields().get("diverging", 0))),
             "seconds": seconds, **scores.diagnose(NAMES, draws), "force_mean": mean, "force_sd": sd,
-            "rmse": scores.rmse(mean, truth), "truth": true_values(data),
+            "rmse": scores.rmse(mean, truth), "truth": true_parameters(data),
             "coverage": scores.interval_coverage(*scores.interval(mean, sd), truth)}
 
 
-def true_values(data: problem.DataSet) -> np.ndarray:
+def true_parameters(data: problem.DataSet) -> np.ndarray:
     """Return the true value of every parameter, in the order of `NAMES`."""
     rates = data.rates
     return np.concatenate([rates.basal, rates.decay, rates.sensitivity, rates.start - rates.basal / rates.decay,
                            [*LEVELS.values()]])
 
 
-def _weighted(settings: Mapping[str, Any], iterations: int, data: problem.DataSet, draws: np.ndarray
+def _resample_draws(settings: Mapping[str, Any], iterations: int, data: problem.DataSet, draws: np.ndarray
               ) -> tuple[np.ndarray, float]:
     """Return draws resampled to the posterior with the iterated likelihood, and the Pareto index of the weights."""
     def log_ratio(theta: jax.Array) -> jax.Array:
@@ -142,18 +142,18 @@ def _weighted(settings: Mapping[str, Any], iterations: int, data: problem.DataSe
         return iterated - plain
 
     flat = jnp.asarray(draws.reshape(len(draws), -1).T)
-    ratios = jax.jit(lambda all_: jax.lax.map(log_ratio, all_, batch_size=min(BATCH, len(all_))))(flat)
+    ratios = jax.jit(lambda points: jax.lax.map(log_ratio, points, batch_size=min(BATCH, len(points))))(flat)
     smoothed = importance.smooth(np.asarray(ratios).reshape(draws.shape[1:]))
     if not np.isfinite(smoothed.log_weight).any(axis=1).all():
         raise ValueError("the iterated likelihood is zero at all draws of a chain, which cannot be weighted; use more "
                          "draws or no iterations.")
     # Another order than that of the chain would overstate the effective sample size.
     indices = [np.sort(importance.resample(weights, len(weights), chain))
-             for chain, weights in enumerate(smoothed.log_weight)]
+               for chain, weights in enumerate(smoothed.log_weight)]
     return np.stack([draws[:, chain, index] for chain, index in enumerate(indices)], axis=1), smoothed.k
 
 
-def _marginalised(settings: Mapping[str, Any], iterations: int, data: problem.DataSet, draws: np.ndarray
+def _marginalise_force(settings: Mapping[str, Any], iterations: int, data: problem.DataSet, draws: np.ndarray
                   ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and standard deviation of the force at `FORCE_TIMES` with the parameters marginalised."""
     def smooth_force(theta: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.experiments.ballistic.problem import default_data, simulate_target, true_likelihood
 from lfm_ppl.experiments.scores import interval, rmse, score_path
-from lfm_ppl.experiments.simulated.problem import SimulationProblem, default_data, simulate_record, true_likelihood
 from lfm_ppl.experiments.tasks import dataset_indices, stack_results
 from lfm_ppl.experiments.timing import time_compiled_call
 from lfm_ppl.linearisation.rule import Rule
@@ -34,33 +34,33 @@ RULES: dict[str, Rule] = {"cubature": Cubature(), "Taylor": Taylor(), "Gauss-Her
 DEFAULT_RULE = next(iter(RULES))
 
 
-def run_gaussian(problem: SimulationProblem, task: Task) -> Result:
-    """Return the scores of a rule on every data set of a task, see `_score`, and ``mean`` and ``sd`` of the first."""
+def run_gaussian(task: Task) -> Result:
+    """Return the scores of a rule on every target of a task, see `_score`, and ``mean`` and ``sd`` of the first."""
     rule = task.settings["method"]
-    filtering, smoothing = _gaussian_programs(problem, rule)
-    rows = [_score(problem, task, index, rule, filtering, smoothing)[0] for index in dataset_indices(task)]
+    filtering, smoothing = _gaussian_programs(rule)
+    rows = [_score(task, index, rule, filtering, smoothing)[0] for index in dataset_indices(task)]
     return stack_results(rows, first_only=("mean", "sd"))
 
 
 @functools.cache
-def _gaussian_programs(problem: SimulationProblem, rule: str) -> tuple[Callable, Callable]:
-    """Return filter and smoother with the likelihood's steps, iterations and sites, compiled for all data sets."""
-    likelihood = copy.copy(true_likelihood(problem))
+def _gaussian_programs(rule: str) -> tuple[Callable, Callable]:
+    """Return filter and smoother with the likelihood's steps, iterations and sites, compiled for all targets."""
+    likelihood = copy.copy(true_likelihood())
     likelihood.rule = RULES[rule]
 
     def filtering(y: jax.Array) -> tuple[jax.Array, jax.Array]:
         result = likelihood.filter(y)
         return result.filtered_mean, result.log_likelihood
 
-    return jax.jit(filtering), jax.jit(lambda y: smoothed_paths(problem, likelihood.smooth(y)))
+    return jax.jit(filtering), jax.jit(lambda y: smoothed_paths(likelihood.smooth(y)))
 
 
-def run_particles(problem: SimulationProblem, task: Task) -> Result:
-    """Return the scores of particles on one data set, see `_score`.
+def run_particles(task: Task) -> Result:
+    """Return the scores of particles on one target, see `_score`.
 
     ``distinct`` (T,) is the number of distinct particles on the smoothed paths.
     """
-    model, times = true_likelihood(problem).model, default_data(problem).times
+    model, times = true_likelihood().model, default_data().times
     filter_key, smoother_key = jax.random.split(task.key)
     options = {"particles": task.settings["particles"], "steps": task.settings["steps"]}
 
@@ -71,49 +71,43 @@ def run_particles(problem: SimulationProblem, task: Task) -> Result:
     def smoothing(y: np.ndarray) -> ParticleSmootherResult:
         return particle_smoother(smoother_key, model, times, y, draws=task.settings["draws"], method=TRACING, **options)
 
-    scores, smoothed = _score(problem, task, task.settings["index"], str(options), filtering, smoothing,
-                              functools.partial(smoothed_paths, problem))
+    scores, smoothed = _score(task, task.settings["index"], str(options), filtering, smoothing, smoothed_paths)
     return scores | {"distinct": np.asarray(smoothed.distinct)}
 
 
-def smoothed_paths(problem: SimulationProblem, result: Any) -> tuple[jax.Array, jax.Array]:
-    """Return means and standard deviations (K, T) of the problem's paths from a smoother's result."""
-    states = true_likelihood(problem).model.state_names
-    paths = [result.state(name) if name in states else result.force(name) for name in problem.paths]
+def smoothed_paths(result: Any) -> tuple[jax.Array, jax.Array]:
+    """Return means and standard deviations (3, T) of the paths from a smoother's result."""
+    paths = result.state("altitude"), result.state("speed"), result.force("u")
     return jnp.stack([path.mean for path in paths]), jnp.stack([path.sd for path in paths])
 
 
-def _score(problem: SimulationProblem, task: Task, index: int, label: str, filtering: Callable, smoothing: Callable,
+def _score(task: Task, index: int, label: str, filtering: Callable, smoothing: Callable,
            paths: Callable[[Any], tuple] = tuple) -> tuple[Result, Any]:
-    """Filter and smooth a data set; CPU times exclude compilation, which the first call with a label takes.
+    """Filter and smooth a target; CPU times exclude compilation, which the first call with a label takes.
 
     Args:
-        problem: the problem.
         task: task with the seed of the data.
-        index: index of the data set.
+        index: index of the target.
         label: label of the compiled programs.
         filtering: map from data to means of the joint state and terms of the log likelihood.
         smoothing: map from data to a smoother's result.
-        paths: map from this result to means and standard deviations (K, T) of the paths.
+        paths: map from this result to means and standard deviations (3, T) of the paths.
 
     Returns:
         A result and the smoother's result. The first has ``filter_rmse``, ``smoother_rmse`` and ``smoother_coverage``
-        (K,), the filter's ``log_likelihood``, the CPU times ``filter_seconds`` and ``smoother_seconds`` (which includes
-        the filter pass of the smoother), and ``mean`` and ``sd`` (K, T) of the paths.
+        (3,), the filter's ``log_likelihood``, the CPU times ``filter_seconds`` and ``smoother_seconds`` (which includes
+        the filter pass of the smoother), and ``mean`` and ``sd`` (3, T) of the paths.
     """
-    record, label = simulate_record(problem, index, task.seed), f"{problem}, {label}"
-    filter_s, (joint, log_likelihood) = time_compiled_call(f"{label}, filter", lambda: filtering(record.y))
-    smoother_s, smoothed = time_compiled_call(f"{label}, smoother", lambda: smoothing(record.y))
+    target = simulate_target(index, task.seed)
+    filter_s, (joint, log_likelihood) = time_compiled_call(f"ballistic, {label}, filter", lambda: filtering(target.y))
+    smoother_s, smoothed = time_compiled_call(f"ballistic, {label}, smoother", lambda: smoothing(target.y))
     mean, sd = map(np.asarray, paths(smoothed))
-    return {"filter_rmse": rmse(_filtered_paths(problem, joint), record.paths),
+    return {"filter_rmse": rmse(_filtered_paths(joint), target.paths),
             "log_likelihood": float(log_likelihood.sum()),
-            **score_path("smoother", mean, interval(mean, sd), record.paths), "mean": mean, "sd": sd,
+            **score_path("smoother", mean, interval(mean, sd), target.paths), "mean": mean, "sd": sd,
             "filter_seconds": filter_s, "smoother_seconds": smoother_s}, smoothed
 
 
-def _filtered_paths(problem: SimulationProblem, joint: jax.Array) -> jax.Array:
-    """Return filtered means (K, T) of the problem's paths from means (T, n) of the joint state."""
-    likelihood = true_likelihood(problem)
-    names = (*likelihood.model.state_names, *likelihood.model.force_names)
-    inputs = jax.vmap(likelihood.ssm.inputs)(jnp.asarray(joint), jnp.asarray(default_data(problem).times))
-    return inputs.T[np.array([names.index(name) for name in problem.paths])]
+def _filtered_paths(joint: jax.Array) -> jax.Array:
+    """Return filtered means (3, T) of the paths from means (T, n) of the joint state."""
+    return jax.vmap(true_likelihood().ssm.inputs)(jnp.asarray(joint), jnp.asarray(default_data().times)).T
