@@ -115,7 +115,7 @@ def _refuse_other(task: StoredFit) -> None:
     posterior = arviz_data.group(task.posterior, "posterior")
     chains = posterior.sizes["chain"]
     draw_indices, rows = evenly_spaced(chains, posterior.sizes["draw"], 1)
-    problem = rebuilding.problem(task.posterior, task.model, model_kwargs=task.keywords).at(rows)
+    problem = rebuilding.problem(task.posterior, task.model, model_kwargs=task.keywords).select(rows)
     log_likelihoods = likelihoods.recorded(problem, likelihoods.gaussian(problem))
     rebuilding.check_likelihood(task.posterior, log_likelihoods.reshape(chains, len(draw_indices)), draw_indices)
 

@@ -106,7 +106,7 @@ class GaussNewtonState(NamedTuple):
     decrement: jax.Array
 
 
-class Dynamics:
+class ConstrainedDynamics:
     """The maps of the intervals of a problem."""
 
     def __init__(self, problem: ConstrainedProblem):
@@ -185,7 +185,7 @@ def _quadratic_form(r: jax.Array, p: jax.Array) -> jax.Array:
 
 def solve_nonlinear(problem: ConstrainedProblem, tolerance: float, max_passes: int) -> Solution:
     """Solve the problem of any model; arguments as in `lfm_ppl.constrained.interior_point.solve_linear`."""
-    dynamics = Dynamics(problem)
+    dynamics = ConstrainedDynamics(problem)
     no_targets = problem.no_targets
     forward_pass, smoothed, _ = smoother_pass(problem, no_targets, jnp.ones_like(no_targets))
     margins = constraint_margins(problem, smoothed)
@@ -211,7 +211,7 @@ def solve_nonlinear(problem: ConstrainedProblem, tolerance: float, max_passes: i
                     last.passes, last.is_finished & is_finite & ~is_violated.any())
 
 
-def _step(problem: ConstrainedProblem, dynamics: Dynamics, margins: ConstraintMargins, iterate: InteriorPointIterate,
+def _step(problem: ConstrainedProblem, dynamics: ConstrainedDynamics, margins: ConstraintMargins, iterate: InteriorPointIterate,
           tolerance: float) -> InteriorPointIterate:
     """Take one damped Gauss-Newton step with a line search on the merit function."""
     is_fixed, state = margins.is_fixed, iterate.primal
@@ -295,7 +295,7 @@ def _gauss_newton_pass(problem: ConstrainedProblem, trajectory: Trajectory, maps
             weight * trajectory.r + (1.0 - weight) * smoothed.adjoint[0], noise)
 
 
-def _initial_trajectory(problem: ConstrainedProblem, dynamics: Dynamics, forward_pass: FilterTrace,
+def _initial_trajectory(problem: ConstrainedProblem, dynamics: ConstrainedDynamics, forward_pass: FilterTrace,
                         smoothed: SmootherTrace) -> Trajectory:
     """Return the trajectory with the disturbances of the extended Kalman smoother, or without any if it is better."""
     candidates = []

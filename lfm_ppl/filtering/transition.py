@@ -81,7 +81,10 @@ def linear_part(ssm: StateSpaceModel, t: jax.Array) -> LinearPart:
     """Return the constant linear part of the dynamics; ``t`` is any time."""
     mean, _ = ssm.initial()
     matrix, offset = ssm.input_map(t)
-    function = lambda w: (ssm.drift(w, t), ())  # noqa: E731
+
+    def function(w: jax.Array) -> tuple[jax.Array, tuple]:
+        return ssm.drift(w, t), ()
+
     jacobian = constant_jacobian(function, matmul(matrix, mean[:, None])[:, 0] + offset, ssm.drift_structure,
                                  ssm.physical_dim)
     usable = jacobian if ssm.constant_measurement else jacobian * (np.arange(ssm.input_dim) < ssm.physical_dim)
@@ -151,7 +154,10 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
     force_cov_full = congruence(half_z, force_cov_half) + force_cov_half
     inputs = ssm.stack.dispersion()
     at_half, at_full = matmul(half_z, inputs), matmul(full_z, inputs)
-    root = lambda weight: safe_sqrt(weight * step)  # noqa: E731
+
+    def root(weight: float) -> jax.Array:
+        return safe_sqrt(weight * step)
+
     columns: tuple[jax.Array, ...] = (jnp.concatenate(
         [root(1 / 6) * at_full, root(1 / 3) * at_half, root(1 / 3) * at_half, root(1 / 6) * inputs], axis=1),)
     if stages:

@@ -93,7 +93,7 @@ class BoundModel:
 
     @property
     def site(self) -> LikelihoodSite:
-        """The likelihood site at the prior's medians; its times, settings and names are those of every draw.
+        """The likelihood site at the prior medians; times, settings and names do not depend on the draw.
 
         Raises:
             ValueError: the model has no such site, or several.
@@ -364,7 +364,7 @@ class BoundModel:
 
         Args:
             z: (d,), or site name -> value.
-            at: (K,) times; None: those of the data.
+            at: (K,) times; None: the times of the data.
             y: as in `log_density`.
 
         Raises:

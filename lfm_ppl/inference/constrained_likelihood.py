@@ -153,7 +153,7 @@ class ConstrainedLikelihood(SeriesLikelihood):
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate observations along trajectories that respect the constraints: (*sample_shape, T, D).
 
-        The trajectories are those of the (linearised) model, as far as 64 candidates represent it.
+        Trajectories follow the (linearised) model, as far as 64 candidates represent it.
         """
 
         def draw(key: jax.Array) -> jax.Array:

@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol, cast
 
 import jax
@@ -57,19 +57,18 @@ def map_series(distribution: SeriesLikelihood | Panel, function: Callable, *argu
     return function(distribution, *arguments)
 
 
-def map_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, *,
-              rows: int | None = None, label: str = "", report: Reporter | None = None,
-              store: BatchStore | None = None) -> Any:
+def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, *,
+              rows: int | None = None, report: Reporter | None = None, store: BatchStore | None = None) -> Any:
     """Return ``per_draw(values, key, y)`` for all draws (S, ...).
 
     Args:
         bound: the model and its data y.
-        name: everything that ``per_draw`` depends on besides the model, so that it is compiled once.
+        name: name of the computation, or a tuple of it and all that ``per_draw`` depends on besides the model: the key
+            of the compiled function.
         per_draw: maps site values, a random key and the model's ``argument`` to a pytree of arrays.
         draws: site name -> (S, ...).
         key: a JAX random key.
         rows: rows of the scan over time, which decide the size of a batch; None: one draw after another.
-        label: name of the computation in lines of progress.
         report: target of the progress.
         store: stores the batches.
     """
@@ -101,6 +100,7 @@ def map_draws(bound: BoundModel, name: Hashable, per_draw: Callable, draws: Mapp
     if len(arguments) > 1 and parallel > 1:
         run = cast(Any, run).lower(*arguments[0]).compile()
     computed = side_by_side(lambda *batch: jax.tree.map(np.asarray, run(*batch)), arguments, parallel)
+    label = name if isinstance(name, str) else name[0]
     with contextlib.closing(computed) as new, Progress(report, count, "draws", label) as progress:
         progress.start()
         progress.compile(f"compiling, and the first of {count:,} draws")

@@ -34,7 +34,7 @@ class ParticleLikelihood(dist.Distribution):
         base: the likelihood of the model; its times are used, its rule is not.
         key: a JAX random key. The log density is a deterministic function of it.
         settings: checked settings of the filter.
-        steps: integration steps between two times; None: those of ``base``.
+        steps: integration steps between two times; None: as in ``base``.
     """
 
     support = constraints.real_matrix
@@ -70,7 +70,7 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         fn: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
         key: a JAX random key; another one gives another estimate.
         settings: checked settings of the filter.
-        steps: integration steps between two times; None: those of the model.
+        steps: integration steps between two times; None: as in the model.
 
     Example:
         >>> import jax, jax.numpy as jnp, numpyro, lfm_ppl as lfm
@@ -116,7 +116,7 @@ class ParticlePotential:
     Args:
         bound: the model and its data.
         settings: of the filter; the scheme is chosen, and everything checked, here.
-        steps: integration steps between two times; None: those of the model.
+        steps: integration steps between two times; None: as in the model.
 
     Raises:
         ValueError: there is no likelihood site, or several; what the particle filter raises.

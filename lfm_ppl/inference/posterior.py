@@ -69,13 +69,12 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *,
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         return map_series(bound.likelihood(values, y), score_series, bound.data(y))
 
-    return map_draws(bound, "scores", per_draw, draws, jax.random.key(0), rows=bound.times.size, label="scores",
-                     report=report, store=store)
+    return map_draws(bound, "scores", per_draw, draws, jax.random.key(0), rows=bound.times.size, report=report,
+                     store=store)
 
 
 def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
                  particles: ParticleSettings | None = None, particle_steps: int | None = None, *,
-                 log_likelihood: bool = False,
                  report: Reporter | None = None, store: BatchStore | None = None) -> Any:
     """Draw one trajectory for each draw of the parameters, given the data, and new data along it.
 
@@ -89,7 +88,6 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         at: (K,) times of the trajectories, or None for the observation times.
         particles: settings of the particle smoother; None: the Gaussian smoother.
         particle_steps: integration steps of the particles between two observations; None: the model's.
-        log_likelihood: whether to return that of the Gaussian filter, (S, ...), unless there are particles.
         report: as in `map_draws`.
         store: as in `map_draws`.
 
@@ -104,7 +102,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         Gaussian smoother ``state_mean``, ``state_sd``, ``force_mean`` and ``force_sd``, the normal distribution that
         the path is drawn from, with the path itself and zero where it is simulated; ``deterministic_points``,
         ``output_points`` and ``noise_sd_points`` (S, ..., P, K, size), where these functions are not linear, at points
-        of that distribution.
+        of that distribution; and ``log_likelihood`` (S, ...).
     """
     at = None if at is None else np.asarray(at, float)
     if at is not None and bound.times.ndim == 1 and np.array_equal(at, bound.times):
@@ -138,7 +136,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             results = _moments(ssm, smoothed, w, is_smoothed, plan)
             gaussian = not (isinstance(ssm.model.observation, ObservationFamily) or noise_of_rows(distribution))
             results |= _points(ssm, smoothed, w, when, is_smoothed, plan, jax.random.fold_in(path_key, 2), gaussian)
-            results |= {"log_likelihood": smoothed.log_likelihood.sum()} if log_likelihood else {}
+            results |= {"log_likelihood": smoothed.log_likelihood.sum()}
         else:
             smoothed = None
             w, when = _particle_path(distribution, y, plan.times, path_key, particles,
@@ -183,9 +181,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
 
     rows = plan.rows
     width = 1 if particles is None else particles.particles
-    name = ("trajectories", signature(at), particles, particle_steps, is_forecast, log_likelihood)
-    return map_draws(bound, name, per_draw, draws, key, rows=rows * width, label="trajectories", report=report,
-                     store=store)
+    name = ("trajectories", signature(at), particles, particle_steps, is_forecast)
+    return map_draws(bound, name, per_draw, draws, key, rows=rows * width, report=report, store=store)
 
 
 def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Array,

@@ -38,7 +38,7 @@ def prior(distribution: Any) -> str:
 
 
 def _in_words(distribution: Any, size: int | None = None, entries: np.ndarray | None = None) -> str:
-    """Return name and arguments of a distribution, of a vector of this size those of some entries."""
+    """Return name and arguments of a distribution; of a long vector the arguments of some entries."""
     while hasattr(distribution, "base_dist") and type(distribution).__name__ in (
             "Independent", "ExpandedDistribution", "MaskedDistribution"):
         distribution = distribution.base_dist

@@ -35,7 +35,7 @@ def _looks_like_code(value: float) -> bool:
     """Whether a number is of the kind that stands for a missing value: -9, 99, -999.9, -999.25, 7777, 1e30, -32768."""
     if abs(value) >= 1e30 or value in _INTEGER_LIMITS:
         return True
-    for digits in (7, 15):  # those of single and of double precision
+    for digits in (7, 15):  # digits of single and of double precision
         mantissa, _, exponent = f"{abs(value):.{digits}g}".partition("e")
         if exponent and int(exponent) < 0:
             return False

@@ -351,7 +351,7 @@ def _check_order(source: Table, times: np.ndarray, time_texts: Sequence[str], fr
     if (column := _series_column(source, times, free)) is not None:
         cells = source.columns[column]
         raise ValueError(f"{location}, where the column {column!r} changes from {cells[k - 1]} to {cells[k]}. If it "
-                         f"names several series, fit each by itself: --series {column} (lfm.data.read_series(path, "
+                         f"names several series, fit them separately: --series {column} (lfm.data.read_series(path, "
                          f"{column!r}), or lfm.read_table of each part of a DataFrame).")
     raise ValueError(f"{location}. Sort the rows by time; replicates are rows with the same time.{more}")
 

@@ -49,7 +49,7 @@ class Data:
             read as zero.
         origin: the calendar time of t = 0 as ISO 8601 text, where the times were dates.
 
-    Times may be dates (``datetime64``, a DatetimeIndex, ...), also those of inputs. They become numbers since the
+    Times, also of inputs, may be dates (``datetime64``, a DatetimeIndex, ...). They become numbers since the
     origin, by default the midnight before the first of them, in the unit of ``units["time"]``, by default that of the
     time between rows.
 
@@ -159,8 +159,8 @@ def on_clock_of(data: Data, reference: Data) -> Data:
         return data
     if data.origin is None or reference.origin is None:
         dated, plain = ("first", "others") if data.origin else ("others", "first")
-        raise ValueError(f"the times of two tables cannot be compared: those of the {dated} are dates, those of the "
-                         f"{plain} plain numbers.")
+        raise ValueError(f"the times of two tables cannot be compared: the times of the {dated} are dates, "
+                         f"the times of the {plain} plain numbers.")
     return at_origin(data, reference.origin, reference.units["time"])
 
 

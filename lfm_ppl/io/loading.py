@@ -16,7 +16,7 @@ and may define, each with a sensible default,
     PARAMETERS   name of a sample site -> help, with its unit
     TARGET_ACCEPT    acceptance that NUTS aims at, where its own 0.8 makes steps too long
 
-A ``model`` that has an argument ``outputs`` or ``units`` is told the names of the outputs and the
+A ``model`` with an argument ``outputs`` or ``units`` gets the names of the outputs and the
 units of the data, for ``LatentForceModel(..., output_names=outputs, units=units)``. One that has an argument ``inputs``
 gets the known inputs of the data: name -> `lfm.Input`, a function of time.
 """

@@ -44,7 +44,7 @@ TRUTH = ("times", *_TRUE_PATHS, "state", "parameters")
 def check_truth(truth: Mapping[str, Any]) -> None:
     """Raise ValueError where a truth, in the form of :attr:`Data.truth`, does not fit together.
 
-    Its names are those of a model, which is not asked here.
+    Its names are not compared with the names of a model.
     """
     for name in truth:
         checks.one_of("entry", name, TRUTH)

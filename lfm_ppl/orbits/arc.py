@@ -41,17 +41,17 @@ class Arc(NamedTuple):
     train: int
 
     def check(self, satellite: str, gaps: str) -> None:
-        """Raise Unusable where too few positions are there to learn from, or none to judge by, with name and gaps."""
-        known = np.isfinite(self.positions).all(axis=1)
-        share = known[:self.train].mean()
+        """Raise Unusable if too few positions exist for training, or none after it."""
+        is_observed = np.isfinite(self.positions).all(axis=1)
+        share = is_observed[:self.train].mean()
         if share < 0.9:
-            raise Unusable(f"{satellite}: {share:.0%} of its positions in training are there, 90% are needed; missing "
+            raise Unusable(f"{satellite}: {share:.0%} of its positions in training exist, 90% are needed; missing "
                            f"{gaps}")
-        if not known[self.train:].any():
-            raise Unusable(f"{satellite}: there is no position after training to judge by; missing {gaps}")
+        if not is_observed[self.train:].any():
+            raise Unusable(f"{satellite}: no position exists after training; missing {gaps}")
 
     def learnt(self) -> np.ndarray:
-        """Return the positions (T, 3), NaN after those of training."""
+        """Return the positions (T, 3), NaN after training."""
         return np.where((np.arange(len(self.times)) < self.train)[:, None], self.positions, np.nan)
 
     def eclipsed(self, path: np.ndarray) -> bool:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.orbits import geopotential, times
-from lfm_ppl.orbits.table import Table
+from lfm_ppl.orbits.table import TimeTable
 
 ASTRONOMICAL_UNIT = 149_597_870.7
 """km."""
@@ -24,7 +24,7 @@ _SPACING = 1.0
 _MARGIN = 4
 
 
-def positions(epoch: float, hours: float) -> Table:
+def positions(epoch: float, hours: float) -> TimeTable:
     """Tabulate Sun and Moon, (6,) in km from the Earth's centre in GCRS, against hours after the epoch.
 
     They come from ERFA's epv00 and moon98, good to about 5 km for the Earth's place around the Sun and 10 km for the
@@ -41,7 +41,7 @@ def positions(epoch: float, hours: float) -> Table:
     nodes = _SPACING * np.arange(-_MARGIN, int(np.ceil(hours / _SPACING)) + _MARGIN + 1)
     tt = times.terrestrial(epoch + 3600.0 * nodes)  # dynamical time differs by milliseconds
     heliocentric, _ = erfa.epv00(*tt)
-    return Table(nodes[0], _SPACING,
+    return TimeTable(nodes[0], _SPACING,
                  ASTRONOMICAL_UNIT * np.concatenate([-heliocentric["p"], erfa.moon98(*tt)["p"]], axis=1))
 
 
@@ -93,6 +93,6 @@ def sunlight(r: jax.Array, sun: jax.Array) -> jax.Array:
     angle = jnp.arctan2(jnp.sqrt((cross * cross).sum() + 1e-20), -(r * to_sun).sum())
     z = (angle - jnp.arcsin(geopotential.RADIUS / radius)) / jnp.arcsin(SUN_RADIUS / distance)
     partly = jnp.abs(z) < 1.0
-    inside = jnp.where(partly, z, 0.0)
-    covered = (jnp.arccos(inside) - inside * jnp.sqrt(1.0 - inside**2)) / jnp.pi
+    overlap_height = jnp.where(partly, z, 0.0)
+    covered = (jnp.arccos(overlap_height) - overlap_height * jnp.sqrt(1.0 - overlap_height**2)) / jnp.pi
     return jnp.where(partly, 1.0 - covered, jnp.where(z > 0.0, 1.0, 0.0))

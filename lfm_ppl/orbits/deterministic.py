@@ -16,17 +16,17 @@ from lfm_ppl.utils import checks
 STEP = 1.0 / 120.0
 """Longest step of the Runge-Kutta method, in hours; its error is 5 cm after ten days of a GPS orbit."""
 _STAGES = np.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
-"""Of the Runge-Kutta method: where in the step, and its weight."""
+"""Nodes and weights of the Runge-Kutta method."""
 _ITERATIONS = 12
 _REACH = 6.0
-"""Hours in which the first nine positions must lie for the search to start near enough."""
+"""Largest span of the first nine positions in hours, for a start near the solution."""
 
 
 class Orbit(NamedTuple):
-    """What determines an orbit.
+    """An orbit: its state at one time.
 
     Attributes:
-        time: of the state (h).
+        time: time of the state (h).
         state: (6,) position (km) and velocity (km/h).
         solar: amplitude of the pressure of sunlight (nm/s^2).
         residual: root mean square distance from the positions that it was fitted to (km).
@@ -47,17 +47,17 @@ def propagate(environment: Environment, orbit: Orbit, times: Any) -> np.ndarray:
     """Return positions and velocities (T, 6) on an orbit.
 
     Args:
-        environment: what surrounds the satellite.
-        orbit: where it is at the first of the times.
+        environment: gravity, Earth rotation, Sun and Moon.
+        orbit: the orbit, with its state at the first time.
         times: (T,) hours, equally spaced.
 
     Raises:
-        ValueError: times that are not equally spaced, or do not begin at the orbit's.
+        ValueError: times that are not equally spaced, or do not start at the orbit's time.
     """
     times = np.asarray(times, float)
     interval = _interval(times)
     if abs(times[0] - orbit.time) > 1e-9:
-        raise ValueError(f"times must begin with that of the orbit, {orbit.time:g} h, got {times[0]:g} h.")
+        raise ValueError(f"times must start at the time of the orbit, {orbit.time:g} h, got {times[0]:g} h.")
     parameters = jnp.asarray(np.append(orbit.state, orbit.solar))
     return np.asarray(_path_compiled(environment, parameters, times[0], interval, len(times), _steps(interval)))
 
@@ -66,10 +66,10 @@ def fit_orbit(environment: Environment, times: Any, positions: Any, solar: float
     """Fit an orbit to positions by least squares, the Gauss-Newton method.
 
     Args:
-        environment: what surrounds the satellite.
+        environment: gravity, Earth rotation, Sun and Moon.
         times: (T,) hours, equally spaced.
-        positions: (T, 3) km in axes that do not turn; rows with NaN do not count.
-        solar: amplitude of the pressure of sunlight (nm/s^2); None: fitted, too.
+        positions: (T, 3) km in inertial axes; rows with NaN are ignored.
+        solar: amplitude of the solar pressure (nm/s^2); None: estimated.
 
     Returns:
         The orbit, its state at the first time.
@@ -85,8 +85,8 @@ def fit_orbit(environment: Environment, times: Any, positions: Any, solar: float
     interval = _interval(times)
     start, _, reach = polynomial_state(times, positions)
     if reach > _REACH:
-        raise ValueError(f"the search for an orbit begins with nine positions in its first {_REACH:g} hours; here they "
-                         f"take {reach:g} h. Begin where the positions begin.")
+        raise ValueError(f"the search for an orbit needs nine positions in its first {_REACH:g} hours; here they "
+                         f"span {reach:g} h. Start the data at the first position.")
     parameters = jnp.asarray(np.append(start, SOLAR_PRESSURE if solar is None else solar))
     free = 7 if solar is None else 6
     for _ in range(_ITERATIONS):
@@ -97,9 +97,9 @@ def fit_orbit(environment: Environment, times: Any, positions: Any, solar: float
             break
     else:
         raise ValueError(f"no orbit fits these positions: after {_ITERATIONS} steps of the search the distance is "
-                         f"{float(residual):.3g} km and still changing. Is there a manoeuvre among them?")
-    found = np.asarray(parameters)
-    return Orbit(float(times[0]), found[:6], float(found[6]), float(residual))
+                         f"{float(residual):.3g} km and still changing. Do they contain a manoeuvre?")
+    fitted = np.asarray(parameters)
+    return Orbit(float(times[0]), fitted[:6], float(fitted[6]), float(residual))
 
 
 def _interval(times: np.ndarray) -> float:
@@ -126,16 +126,16 @@ def _path(environment: Environment, parameters: jax.Array, start: Any, interval:
         def stage(carry: tuple[jax.Array, jax.Array], of: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
             last, total = carry
             part, weight = of
-            found = slope(x + part * h * last, t + part * h)
-            return (found, total + weight * found), None
+            stage_slope = slope(x + part * h * last, t + part * h)
+            return (stage_slope, total + weight * stage_slope), None
 
-        # In a loop, as the pull of the Earth is long to compile.
+        # A loop, because the gravity of the Earth takes long to compile.
         (_, total), _ = jax.lax.scan(stage, (jnp.zeros_like(x), jnp.zeros_like(x)), jnp.asarray(_STAGES))
         return x + h * total, None
 
     def row(x: jax.Array, index: jax.Array) -> tuple[jax.Array, jax.Array]:
-        after, _ = jax.lax.scan(step, x, start + interval * index + h * jnp.arange(steps))
-        return after, x
+        next_state, _ = jax.lax.scan(step, x, start + interval * index + h * jnp.arange(steps))
+        return next_state, x
 
     return jax.lax.scan(row, parameters[:6], jnp.arange(count))[1]
 
@@ -146,16 +146,18 @@ _path_compiled = jax.jit(_path, static_argnums=(4, 5))
 @functools.partial(jax.jit, static_argnums=(5, 6))
 def _gauss_newton(environment: Environment, parameters: jax.Array, positions: jax.Array, start: Any, interval: Any,
                   steps: int, free: int) -> tuple[jax.Array, jax.Array]:
-    """Return the change of the free parameters, and the distance that the present ones leave."""
-    known = jnp.isfinite(positions).all(axis=1)
+    """Return the change of the free parameters, and the root mean square distance before it."""
+    is_observed = jnp.isfinite(positions).all(axis=1)
 
     def residuals(some: jax.Array) -> tuple[jax.Array, jax.Array]:
         path = _path(environment, jnp.concatenate([some, parameters[free:]]), start, interval, positions.shape[0],
                      steps)
-        found = jnp.where(known[:, None], path[:, :3] - jnp.where(known[:, None], positions, 0.0), 0.0).ravel()
-        return found, found
+        distances = jnp.where(
+            is_observed[:, None], path[:, :3] - jnp.where(is_observed[:, None], positions, 0.0), 0.0
+        ).ravel()
+        return distances, distances
 
-    jacobian, left = jax.jacfwd(residuals, has_aux=True)(parameters[:free])
+    jacobian, residual = jax.jacfwd(residuals, has_aux=True)(parameters[:free])
     scale = jnp.sqrt((jacobian**2).sum(0))
-    change = -jnp.linalg.lstsq(jacobian / scale, left)[0] / scale
-    return change, jnp.sqrt((left**2).sum() / jnp.maximum(known.sum(), 1))
+    change = -jnp.linalg.lstsq(jacobian / scale, residual)[0] / scale
+    return change, jnp.sqrt((residual**2).sum() / jnp.maximum(is_observed.sum(), 1))

@@ -17,7 +17,7 @@ from lfm_ppl.orbits import frames
 from lfm_ppl.orbits.deterministic import Orbit, propagate
 from lfm_ppl.orbits.environment import Environment
 from lfm_ppl.orbits.satellite import Motion, period_of, pushed, wide_start
-from lfm_ppl.orbits.table import Table
+from lfm_ppl.orbits.table import TimeTable
 from lfm_ppl.utils import checks
 
 _FINEST = 1 / 120
@@ -36,7 +36,7 @@ class Neighbourhood(eqx.Module):
     """
 
     path: jax.Array
-    slopes: Table
+    slopes: TimeTable
     on_orbit: jax.Array
     axes: str = eqx.field(static=True)
     period: Any
@@ -72,8 +72,13 @@ class Neighbourhood(eqx.Module):
         values = np.asarray(slopes).reshape(len(fine), 3, -1)
         by_force = _means(values[:, :, 6:].reshape(len(fine), -1), finer).reshape(-1, 3, len(on_orbit))
         table = np.concatenate([values[::finer, :, :6], by_force], axis=2)
-        return cls(jnp.asarray(path[::count]), Table(fine[0], spacing, table.reshape(len(table), -1)), on_orbit, axes,
-                   period_of(path))
+        return cls(
+            jnp.asarray(path[::count]),
+            TimeTable(fine[0], spacing, table.reshape(len(table), -1)),
+            on_orbit,
+            axes,
+            period_of(path),
+        )
 
     def __call__(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
         """Return the derivatives (6,) of a departure x (6,) under the small forces u (R,)."""
@@ -83,12 +88,12 @@ class Neighbourhood(eqx.Module):
 
 @jax.jit
 def _slopes(motion: Motion, path: jax.Array, u: jax.Array, times: jax.Array) -> jax.Array:
-    def one(inputs: tuple[jax.Array, jax.Array]) -> jax.Array:
+    def slopes_at(inputs: tuple[jax.Array, jax.Array]) -> jax.Array:
         x, t = inputs
         by_state, by_force = jax.jacfwd(motion.acceleration, argnums=(0, 1))(x, u, t)
         return jnp.concatenate([by_state, by_force], axis=1).ravel()
 
-    return jax.lax.map(one, (path, times))
+    return jax.lax.map(slopes_at, (path, times))
 
 
 def _means(values: np.ndarray, finer: int) -> np.ndarray:
@@ -101,19 +106,19 @@ def _means(values: np.ndarray, finer: int) -> np.ndarray:
     nodes = values[::finer].copy()
     if len(nodes) < 5:
         return nodes
-    one, two = (_mean_over(values, half) for half in (finer, 2 * finer))
+    half_means, full_means = (_mean_over(values, half) for half in (finer, 2 * finer))
     inner = slice(2, len(nodes) - 2)
     narrow, wide = (half**2 / 3 + 1 / 6 for half in (finer, 2 * finer))  # second moments of the trapezoidal rule
-    nodes[inner] = (wide * one[::finer][inner] - narrow * two[::finer][inner]) / (wide - narrow)
+    nodes[inner] = (wide * half_means[::finer][inner] - narrow * full_means[::finer][inner]) / (wide - narrow)
     return nodes
 
 
 def _mean_over(values: np.ndarray, half: int) -> np.ndarray:
-    """Return means of what is linear between the values (K, C), over ``half`` intervals to each side; NaN at ends."""
+    """Return means of the linear interpolant of the values (K, C) over ``half`` intervals to each side; NaN at ends."""
     below = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(0.5 * (values[1:] + values[:-1]), axis=0)])
-    found = np.full_like(values, np.nan)
-    found[half:len(values) - half] = (below[2 * half:] - below[:len(values) - 2 * half]) / (2 * half)
-    return found
+    hourly_means = np.full_like(values, np.nan)
+    hourly_means[half:len(values) - half] = (below[2 * half:] - below[:len(values) - 2 * half]) / (2 * half)
+    return hourly_means
 
 
 def departure(near: Neighbourhood, forces: Mapping[str, Force], white: Any = 0.0, noise_sd: Any = 5e-5,
@@ -142,7 +147,7 @@ def departure(near: Neighbourhood, forces: Mapping[str, Force], white: Any = 0.0
     Example:
         >>> import lfm_ppl as lfm
         >>> near = Neighbourhood.of(environment, orbit, times)  # doctest: +SKIP
-        >>> nowhere = Table(0.0, 1.0, np.zeros((4, 27)))  # no gravity, no sunlight
+        >>> nowhere = TimeTable(0.0, 1.0, np.zeros((4, 27)))  # no gravity, no sunlight
         >>> near = Neighbourhood(jnp.zeros((4, 6)), nowhere, jnp.zeros(3), "DYB", lfm.orbits.GPS_PERIOD)
         >>> model = departure(near, lfm.orbits.small_forces("DYB"))
         >>> found = lfm.filter(model, np.arange(2.0), np.zeros((2, 3)), lfm.Taylor(), steps=1)

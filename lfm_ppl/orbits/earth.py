@@ -12,7 +12,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from lfm_ppl.orbits import times
-from lfm_ppl.orbits.table import Table
+from lfm_ppl.orbits.table import TimeTable
 
 _SPACING = 3.0  # hours; the cubic through it is within 1e-12 rad for the nutation's fastest term
 _MARGIN = 4
@@ -51,16 +51,16 @@ def orientation(seconds: np.ndarray) -> Orientation:
     """
     first, second = times.utc(seconds)
     mjd = np.asarray(first - 2_400_000.5 + second)
-    known, values = _daily_values()
-    if mjd.min() < known[4] or mjd.max() > known[-5]:
-        raise ValueError(f"Earth orientation is known from MJD {known[4]:.0f} to {known[-5]:.0f}; asked for "
+    table_days, values = _daily_values()
+    if mjd.min() < table_days[4] or mjd.max() > table_days[-5]:
+        raise ValueError(f"Earth orientation is known from MJD {table_days[4]:.0f} to {table_days[-5]:.0f}; asked for "
                          f"{mjd.min():.1f} to {mjd.max():.1f}. A newer release of astropy-iers-data knows more.")
-    near = (known >= mjd.min() - 4) & (known <= mjd.max() + 4)
-    known, values = known[near], values[near].copy()
+    is_near = (table_days >= mjd.min() - 4) & (table_days <= mjd.max() + 4)
+    table_days, values = table_days[is_near], values[is_near].copy()
     leap = np.round(np.concatenate([[0.0], np.cumsum(np.diff(values[:, 0]))]))  # UT1 - UTC jumps with a leap second
     values[:, 0] -= leap
-    smooth = CubicSpline(known, values)(mjd).T
-    smooth[0] += leap[np.searchsorted(known, mjd, side="right") - 1]
+    smooth = CubicSpline(table_days, values)(mjd).T
+    smooth[0] += leap[np.searchsorted(table_days, mjd, side="right") - 1]
     return Orientation(*smooth)
 
 
@@ -86,7 +86,7 @@ class EarthRotation(eqx.Module):
         rate: its growth (rad/h).
     """
 
-    table: Table
+    table: TimeTable
     angle: jax.Array
     rate: jax.Array
 
@@ -101,22 +101,32 @@ class EarthRotation(eqx.Module):
         erfa = times.library("erfa")
         nodes = _SPACING * np.arange(-_MARGIN, int(np.ceil(hours / _SPACING)) + _MARGIN + 1)
         seconds = epoch + 3600.0 * nodes
-        found = orientation(seconds)
+        earth_orientation = orientation(seconds)
         tt = times.terrestrial(seconds)
         x, y, s = erfa.xys06a(*tt)
         first, second = times.utc(seconds)
-        ut1 = erfa.utcut1(first, second, found.ut1_minus_utc)
+        ut1 = erfa.utcut1(first, second, earth_orientation.ut1_minus_utc)
         rate = 2 * np.pi * 1.00273781191135448 / 24.0
         start = float(erfa.era00(times.GPS_START, epoch / times.DAY))
-        ahead = erfa.era00(*ut1) - start - rate * nodes
-        values = np.stack([x + found.dx, y + found.dy, s, found.x, found.y, erfa.sp00(*tt),
-                           np.unwrap(np.remainder(ahead, 2 * np.pi))], axis=1)
-        return cls(Table(nodes[0], _SPACING, values), jnp.asarray(start), jnp.asarray(rate))
+        rotation_excess = erfa.era00(*ut1) - start - rate * nodes
+        values = np.stack(
+            [
+                x + earth_orientation.dx,
+                y + earth_orientation.dy,
+                s,
+                earth_orientation.x,
+                earth_orientation.y,
+                erfa.sp00(*tt),
+                np.unwrap(np.remainder(rotation_excess, 2 * np.pi)),
+            ],
+            axis=1,
+        )
+        return cls(TimeTable(nodes[0], _SPACING, values), jnp.asarray(start), jnp.asarray(rate))
 
     def __call__(self, t: jax.Array) -> jax.Array:
         """Return the matrix (3, 3) at ``t`` hours after the epoch; its transpose leads back."""
-        x, y, s, px, py, sp, ahead = self.table(t)
-        era = self.angle + self.rate * t + ahead
+        x, y, s, px, py, sp, rotation_excess = self.table(t)
+        era = self.angle + self.rate * t + rotation_excess
         # The celestial pole: Q' = [[1 - a x^2, -a x y, x], ...] R3(s), a = 1 / (1 + cos d).
         a = 1.0 / (1.0 + jnp.sqrt(1.0 - x * x - y * y))
         to_gcrs = jnp.stack([jnp.stack([1 - a * x * x, -a * x * y, x]), jnp.stack([-a * x * y, 1 - a * y * y, y]),
@@ -127,15 +137,15 @@ class EarthRotation(eqx.Module):
 
 
 def _about_x(angle: jax.Array) -> jax.Array:
-    c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
-    return jnp.stack([jnp.stack([one, zero, zero]), jnp.stack([zero, c, s]), jnp.stack([zero, -s, c])])
+    c, s, zero, unit = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
+    return jnp.stack([jnp.stack([unit, zero, zero]), jnp.stack([zero, c, s]), jnp.stack([zero, -s, c])])
 
 
 def _about_y(angle: jax.Array) -> jax.Array:
-    c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
-    return jnp.stack([jnp.stack([c, zero, -s]), jnp.stack([zero, one, zero]), jnp.stack([s, zero, c])])
+    c, s, zero, unit = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
+    return jnp.stack([jnp.stack([c, zero, -s]), jnp.stack([zero, unit, zero]), jnp.stack([s, zero, c])])
 
 
 def _about_z(angle: jax.Array) -> jax.Array:
-    c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
-    return jnp.stack([jnp.stack([c, s, zero]), jnp.stack([-s, c, zero]), jnp.stack([zero, zero, one])])
+    c, s, zero, unit = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
+    return jnp.stack([jnp.stack([c, s, zero]), jnp.stack([-s, c, zero]), jnp.stack([zero, zero, unit])])

@@ -21,7 +21,7 @@ from lfm_ppl.orbits.bodies import (
 )
 from lfm_ppl.orbits.earth import EarthRotation
 from lfm_ppl.orbits.ephemerides import Ephemerides
-from lfm_ppl.orbits.table import Table
+from lfm_ppl.orbits.table import TimeTable
 
 PER_HOUR2 = 3600.0**2
 """km/s^2 -> km/h^2."""
@@ -51,7 +51,7 @@ class Environment(eqx.Module):
 
     epoch: Any
     rotation: EarthRotation
-    table: Table
+    table: TimeTable
     degree: int = eqx.field(static=True, default=geopotential.DEGREE)
     bodies: bool = eqx.field(static=True, default=True)
 
@@ -102,10 +102,10 @@ class Environment(eqx.Module):
         s the distance of the Sun, e_sun the direction to it, and nu the part of its disc that the Earth leaves visible.
         """
         sun = self.sun(t)
-        away = r - sun
-        square = (away * away).sum()
+        from_sun = r - sun
+        square = (from_sun * from_sun).sum()
         light = sunlight(r, sun) * ASTRONOMICAL_UNIT**2 / square
-        return NANO * light * away / jnp.sqrt(square)
+        return NANO * light * from_sun / jnp.sqrt(square)
 
     def sunlit_axes(self, r: jax.Array, t: Any) -> jax.Array:
         """Return the axes D, Y and B (3, 3) as columns, times the visible part of the Sun's disc."""

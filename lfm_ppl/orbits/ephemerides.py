@@ -185,21 +185,21 @@ class Ephemerides:
         missing = np.isnan(self.positions[:, self.satellites.index(name)]).any(axis=-1)
         edges = np.flatnonzero(np.diff(missing.astype(int), prepend=0, append=0))
         return [
-            Gap(float(self.epochs[first]), float(self.epochs[after - 1]))
-            for first, after in zip(edges[::2], edges[1::2], strict=True)
+            Gap(float(self.epochs[first]), float(self.epochs[following - 1]))
+            for first, following in zip(edges[::2], edges[1::2], strict=True)
         ]
 
 
-def check_satellites(names: Sequence[str], known: Sequence[str], files: Sequence[str] = ()) -> tuple[str, ...]:
-    """Raise unless ``names`` are some of the ``known`` satellites, each once; return them as a tuple."""
+def check_satellites(names: Sequence[str], available: Sequence[str], files: Sequence[str] = ()) -> tuple[str, ...]:
+    """Raise unless ``names`` are some of the ``available`` satellites, each once; return them as a tuple."""
     if isinstance(names, str):
         raise TypeError(f"satellites must be a sequence of names, such as [{names!r}], got the text {names!r}.")
     if not len(names) or len(set(names)) < len(names):
         raise ValueError(f"satellites must name at least one satellite, and each of them once; got {list(names)}.")
     for name in names:
-        if name not in known:
-            system = [other for other in known if other[:1] == str(name)[:1].upper()]
+        if name not in available:
+            system = [candidate for candidate in available if candidate[:1] == str(name)[:1].upper()]
             where = f" Read from {files[0]}" if files else ""
             where += f" to {files[-1]}, {len(files)} files" if len(files) > 1 else ""
-            raise ValueError(checks.unknown("satellite", name, system or known) + where + ("." if files else ""))
+            raise ValueError(checks.unknown("satellite", name, system or available) + where + ("." if files else ""))
     return tuple(names)

@@ -61,5 +61,5 @@ def dyb(r: jax.Array, sun: jax.Array) -> jax.Array:
 
 def _unit(vector: jax.Array) -> jax.Array:
     square = (vector * vector).sum()
-    known = square > 0.0
-    return jnp.where(known, vector / jnp.sqrt(jnp.where(known, square, 1.0)), 0.0)
+    is_defined = square > 0.0
+    return jnp.where(is_defined, vector / jnp.sqrt(jnp.where(is_defined, square, 1.0)), 0.0)

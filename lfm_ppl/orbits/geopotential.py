@@ -141,12 +141,12 @@ def _solid_harmonics(r: jax.Array, degree: int) -> tuple[jax.Array, jax.Array]:
         sectoral.append((one_v, one_w))
     start = jnp.stack([jnp.stack(column) for column in zip(*sectoral, strict=True)])
     orders = np.arange(degree + 1)
-    before, now = jnp.zeros_like(start), start * (orders == 0)
-    rows = [now]
+    previous, current = jnp.zeros_like(start), start * (orders == 0)
+    rows = [current]
     for n in range(1, degree + 1):
         gap = np.maximum(n - orders, 1)
         climb, drop = (2 * n - 1) / gap * (orders < n), (n + orders - 1) / gap * (orders < n)
-        before, now = now, climb * z * now - drop * rho * before + start * (orders == n)
-        rows.append(now)
+        previous, current = current, climb * z * current - drop * rho * previous + start * (orders == n)
+        rows.append(current)
     v, w = jnp.stack(rows, axis=1)
     return v, w

@@ -4,7 +4,7 @@ Published positions are smoothed by a dynamic model, so that they scatter far le
 marginal likelihood of positions has the forces explain what is left. What counts here is how well held-out positions
 are predicted: from the first third of the training its other two, and from two thirds the last one. Magnitudes weigh
 by exp(WEIGHT * their mean log predictive density) times a prior, whose mode and curvature are found. The prior is what
-satellites have in common: each is learnt by itself first, then again with the mean and scatter of all of them.
+satellites have in common: each is learnt separately first, then again with the mean and scatter of all.
 
 All this runs on departures from an orbit, as a linear regression: see `training`.
 """
@@ -37,7 +37,7 @@ from lfm_ppl.orbits.training import Training, slope_of_held_out, slope_of_log_li
 WEIGHT = 3.0
 """How many positions a fold counts for: neighbours in time are wrong together, most of all along the track.
 
-Chosen from 3, 10 and 30 by the errors of the GPS satellites; those of Galileo and GLONASS confirmed it."""
+Chosen from 3, 10 and 30 by the errors of the GPS satellites; the errors of Galileo and GLONASS confirmed it."""
 DRAWS = 16
 """Magnitudes over which a prediction is averaged."""
 _EVALUATIONS = 40
@@ -66,17 +66,17 @@ class Target(NamedTuple):
             ValueError: the density there is not finite.
         """
         first = self.prior.mean if start is None else start
-        found = quasi_newton(Objective(self.negative), first, options={"maxfun": _EVALUATIONS})
-        if not np.isfinite(found.value):
+        lowest = quasi_newton(Objective(self.negative), first, options={"maxfun": _EVALUATIONS})
+        if not np.isfinite(lowest.value):
             raise ValueError(f"positions have no density at the first magnitudes of the search, {np.exp(first)}.")
-        return found.point
+        return lowest.point
 
     def negative(self, point: Any) -> tuple[float, np.ndarray]:
         """Return minus the log density, and its gradient (d,)."""
         point = np.asarray(point)
         value, gradient = self.evidence(point)
-        away = (point - self.prior.mean) / self.prior.sd
-        return 0.5 * float(away @ away) - value, away / self.prior.sd - gradient
+        standardised = (point - self.prior.mean) / self.prior.sd
+        return 0.5 * float(standardised @ standardised) - value, standardised / self.prior.sd - gradient
 
     def draws(self, mode: np.ndarray, count: int) -> np.ndarray:
         """Return vectors (count, d) about the mode, normal with the curvature there; the same at every call.
@@ -85,10 +85,10 @@ class Target(NamedTuple):
             ValueError: the curvature is not finite.
         """
         mean, sd = self.prior
-        here = self.negative(mode)[1]
+        gradient = self.negative(mode)[1]
         # One-sided: the error of a second derivative is the step times a third, which is nothing beside a Laplace
         # approximation's own.
-        columns = np.stack([(self.negative(mode + _DIFFERENCE * unit)[1] - here) / _DIFFERENCE
+        columns = np.stack([(self.negative(mode + _DIFFERENCE * unit)[1] - gradient) / _DIFFERENCE
                             for unit in np.eye(len(mode))])
         hessian = 0.5 * (columns + columns.T)
         if not np.isfinite(hessian).all():
@@ -110,10 +110,10 @@ def likelihood(data: Training, prior: Prior) -> Target:
 
 
 def _target(value_and_slope: Callable, weight: float, data: Training, prior: Prior) -> Target:
-    known = data.regression
+    regression = data.regression
 
     def evidence(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = value_and_slope(jnp.asarray(logarithms), known, data.axes)
+        value, slope = value_and_slope(jnp.asarray(logarithms), regression, data.axes)
         return weight * float(value), weight * np.asarray(slope)
 
     return Target(evidence, prior)
@@ -122,22 +122,24 @@ def _target(value_and_slope: Callable, weight: float, data: Training, prior: Pri
 def smoothed_forces(data: Training, prior: Prior) -> Target:
     """Return the log likelihood where forces that a Matern model smooths are the data, as in the source: a target."""
     thin = max(1, int(round(_APART / (data.times[1] - data.times[0]))))
-    mean, sd = _smooth_forces(data.near, jnp.asarray(data.y), (tuple(data.times), data.axes))
+    mean, sd = _smooth_forces(data.neighbourhood, jnp.asarray(data.y), (tuple(data.times), data.axes))
     fixed = tuple(data.times[::thin]), data.axes
 
     def evidence(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = _score_forces(jnp.asarray(logarithms), mean[::thin], sd[::thin], data.near.period, fixed)
+        value, gradient = _score_forces(
+            jnp.asarray(logarithms), mean[::thin], sd[::thin], data.neighbourhood.period, fixed
+        )
         return float(value), np.asarray(gradient)
 
     return Target(evidence, prior)
 
 
 @functools.partial(jax.jit, static_argnums=(2,))
-def _smooth_forces(near: Neighbourhood, y: jax.Array, fixed: tuple) -> tuple[jax.Array, jax.Array]:
+def _smooth_forces(neighbourhood: Neighbourhood, y: jax.Array, fixed: tuple) -> tuple[jax.Array, jax.Array]:
     times, axes = np.array(fixed[0]), fixed[1]
     forces = {name: Matern(_SCALE, _LENGTHSCALE, mean=SOLAR_PRESSURE if name == "solar" else 0.0)
               for name in small_forces(axes)}
-    smoothed = smooth(departure(near, forces, noise_sd=NOISE), times, y, rule=Taylor(), steps=steps_of(times))
+    smoothed = smooth(departure(neighbourhood, forces, noise_sd=NOISE), times, y, rule=Taylor(), steps=steps_of(times))
     return smoothed.input_mean[:, 6:], jnp.sqrt(jnp.diagonal(smoothed.input_covariance, axis1=1, axis2=2)[:, 6:])
 
 

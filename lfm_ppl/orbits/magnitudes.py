@@ -1,4 +1,4 @@
-"""How large the small forces are: a vector of logarithms, its prior, and the forces that follow."""
+"""Magnitudes of the small forces: a vector of logarithms, its prior, and the resulting forces."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from lfm_ppl.forces import Force
 from lfm_ppl.orbits.satellite import HARMONICS, small_forces
 
 _SUNLIGHT = 10.0
-"""Standard deviation of the sunlight's acceleration (nm/s^2); the positions tell it far better."""
+"""Standard deviation of the sunlight's acceleration (nm/s^2), which positions determine much better."""
 _LEAST_SD = 0.5
-"""Of the logarithms, where it is taken from a few satellites."""
+"""Smallest standard deviation of the logarithms, if estimated from a few satellites."""
 FEW = 5
-"""Fewer satellites than these do not say what is common to all of them."""
-# What is sampled: median, and standard deviation of its logarithm. In nm/s^2 and hours; the amplitude is over n.
+"""Least number of satellites for an estimated prior."""
+# Median, and standard deviation of the logarithm, in nm/s^2 and hours; amplitudes are divided by n.
 _LEVEL, _DRIFT, _AMPLITUDE, _SHARE, _WHITE = (1.0, 2.0), (1e-3, 2.0), (0.1, 1.5), (0.01, 2.0), (0.01, 2.0)
 
 
@@ -30,7 +30,7 @@ class Prior(NamedTuple):
 
 
 def names(axes: str) -> tuple[str, ...]:
-    """Return what the entries of the vector are.
+    """Return the names of the entries.
 
     Example:
         >>> names("DYB")[:3], len(names("DYB"))
@@ -40,17 +40,17 @@ def names(axes: str) -> tuple[str, ...]:
 
 
 def wide(axes: str) -> Prior:
-    """Return the prior before any satellite is seen."""
-    given = [given for _, given in _entries(axes)]
-    return Prior(np.log([median for median, _ in given]), np.array([sd for _, sd in given]))
+    """Return the prior without data."""
+    entries = [entries for _, entries in _entries(axes)]
+    return Prior(np.log([median for median, _ in entries]), np.array([sd for _, sd in entries]))
 
 
 def common(learnt: list[np.ndarray], axes: str) -> Prior:
-    """Return the prior that several satellites make, the one to be predicted among them: mean and scatter.
+    """Return the prior from several satellites, the predicted one included: mean and scatter.
 
     Args:
-        learnt: vectors (d,), one a satellite; too few of them leave the wide prior.
-        axes: of the small forces.
+        learnt: vectors (d,), one per satellite; fewer than `FEW` give the wide prior.
+        axes: axes of the small forces.
     """
     if len(learnt) < FEW:
         return wide(axes)
@@ -83,8 +83,8 @@ def forces(logarithms: jax.Array, axes: str, period: Any) -> tuple[dict[str, For
     value = dict(zip(names(axes), jnp.exp(logarithms), strict=True))
     harmonics = HARMONICS[axes]
     amplitude = {name: [value[f"amplitude of {name} {n}"] for n in multiples] for name, multiples in harmonics.items()}
-    wander = {name: [value[f"wander of {name} over amplitude"] * one for one in own]
-              for name, own in amplitude.items()}
+    wander = {name: [value[f"wander of {name} over amplitude"] * size for size in sizes]
+              for name, sizes in amplitude.items()}
     level: dict[str, Any] = {"solar": _SUNLIGHT} | {
         name: value[f"level of {name}"] for name in harmonics if name != "solar"}
     drift = {name: value[f"drift of {name}"] for name in harmonics}

@@ -70,7 +70,7 @@ def _from_latest(arc: Arc, end: int, solar: float) -> tuple[int, np.ndarray]:
     return first, propagate(arc.environment, orbit, arc.times[first:])
 
 
-class Prediction(NamedTuple):
+class OrbitPrediction(NamedTuple):
     """What the latent force model says at all times, given some positions, averaged over magnitudes.
 
     Attributes:
@@ -86,61 +86,70 @@ class Prediction(NamedTuple):
     forces_sd: np.ndarray
 
 
-def predict(arc: Arc, near: Neighbourhood, logarithms: np.ndarray, y: np.ndarray | None = None) -> Prediction:
+def predict(
+    arc: Arc, neighbourhood: Neighbourhood, logarithms: np.ndarray, y: np.ndarray | None = None
+) -> OrbitPrediction:
     """Smooth the positions of training, and predict all others.
 
     Args:
         arc: the satellite.
-        near: the orbit that was fitted to it, at all times; see `surroundings`.
+        neighbourhood: the orbit that was fitted to it, at all times; see `surroundings`.
         logarithms: (K, d) of the magnitudes, over which the moments are averaged.
-        y: (T, 3) positions to learn from; None: those of training.
+        y: (T, 3) positions to learn from; None: the positions of training.
     """
-    y = (arc.learnt() if y is None else checks.unmask(y)) - np.asarray(near.path[:, :3])
-    known = np.flatnonzero(np.isfinite(y).any(axis=1))
-    if not len(known):
+    y = (arc.learnt() if y is None else checks.unmask(y)) - np.asarray(neighbourhood.path[:, :3])
+    observed_rows = np.flatnonzero(np.isfinite(y).any(axis=1))
+    if not len(observed_rows):
         raise ValueError("every position is missing (NaN); there is nothing to learn from.")
-    found = _predict(near, jnp.asarray(y), jnp.asarray(logarithms), (tuple(arc.times), near.axes, int(known[-1]) + 1))
-    mean, covariance = map(np.asarray, found)
+    moments = _predict(
+        neighbourhood,
+        jnp.asarray(y),
+        jnp.asarray(logarithms),
+        (tuple(arc.times), neighbourhood.axes, int(observed_rows[-1]) + 1),
+    )
+    mean, covariance = map(np.asarray, moments)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    return Prediction(np.asarray(near.path) + mean[:, :6], covariance[:, :3, :3], mean[:, 6:], sd[:, 6:])
+    return OrbitPrediction(np.asarray(neighbourhood.path) + mean[:, :6], covariance[:, :3, :3], mean[:, 6:], sd[:, 6:])
 
 
 @functools.partial(jax.jit, static_argnums=(3,))
-def _predict(near: Neighbourhood, y: jax.Array, logarithms: jax.Array, fixed: tuple) -> tuple[jax.Array, jax.Array]:
+def _predict(
+    neighbourhood: Neighbourhood, y: jax.Array, logarithms: jax.Array, fixed: tuple
+) -> tuple[jax.Array, jax.Array]:
     times, (axes, seen) = np.array(fixed[0]), fixed[1:]
     settings: dict[str, Any] = {"rule": Taylor(), "steps": training.steps_of(times, _STEP)}
 
-    def one(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
-        system = training.departing(vector, near, axes)
-        found = smooth(system, times[:seen], y[:seen], **settings)
+    def predict_one(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
+        system = training.departing(vector, neighbourhood, axes)
+        smoothed = smooth(system, times[:seen], y[:seen], **settings)
         if seen == len(times):
-            return found.input_mean, found.input_covariance
+            return smoothed.input_mean, smoothed.input_covariance
         # Beyond the last position nothing is to be smoothed, and the filter alone is six times as fast.
-        last = FilterState(jnp.asarray(times[seen - 1]), found.mean[-1], found.covariance[-1])
+        last = FilterState(jnp.asarray(times[seen - 1]), smoothed.mean[-1], smoothed.covariance[-1])
         beyond = filter(system, times[seen:], y[seen:], start=last, **settings)
         matrix, offset = state_space(system).input_map(times[0])
         mean = matmul(beyond.filtered_mean, matrix.T) + offset
         covariance = congruence(matrix, beyond.filtered_covariance)
-        return jnp.concatenate([found.input_mean, mean]), jnp.concatenate([found.input_covariance, covariance])
+        return jnp.concatenate([smoothed.input_mean, mean]), jnp.concatenate([smoothed.input_covariance, covariance])
 
-    means, covariances = jax.lax.map(one, logarithms)
+    means, covariances = jax.lax.map(predict_one, logarithms)
     mean = means.mean(axis=0)
-    away = means - mean
-    return mean, covariances.mean(axis=0) + jnp.einsum("kti,ktj->tij", away, away) / len(away)
+    deviations = means - mean
+    return mean, covariances.mean(axis=0) + jnp.einsum("kti,ktj->tij", deviations, deviations) / len(deviations)
 
 
-def judge(arc: Arc, predicted: Prediction, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return how good a prediction is along axes, the columns of (T, 3, 3), by the positions of all times.
+def judge(arc: Arc, predicted: OrbitPrediction, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compare a prediction with the positions of all times, along the axes in the columns of (T, 3, 3).
 
     Returns:
-        Errors (T, 3) and standard deviations (T, 3) in km, those of the published positions included, and the share of
+        Errors (T, 3) and standard deviations (T, 3) in km, with the errors of published positions, and the share of
         errors after training that lie within the 95% bands, (3,) by axis.
     """
     error = errors(arc, predicted.state, axes)
     sd = np.sqrt(np.einsum("tji,tjk,tki->ti", axes, predicted.covariance, axes) + NOISE**2)
-    after = slice(arc.train, None)
-    known = np.isfinite(arc.positions[after]).all(axis=1)
-    return error, sd, (np.abs(error[after]) < _Z * sd[after])[known].mean(axis=0)
+    predicted_rows = slice(arc.train, None)
+    is_observed = np.isfinite(arc.positions[predicted_rows]).all(axis=1)
+    return error, sd, (np.abs(error[predicted_rows]) < _Z * sd[predicted_rows])[is_observed].mean(axis=0)
 
 
 def errors(arc: Arc, path: np.ndarray, axes: np.ndarray) -> np.ndarray:
@@ -169,15 +178,15 @@ def online(arc: Arc, orbit: Orbit, logarithms: np.ndarray, axes: str, windows: A
     """
     days = arc.times / 24.0
     observed = np.arange(len(days)) < arc.train
-    ends = [arc.train]
+    window_ends = [arc.train]
     for begin, end in windows:
-        inside = (days >= begin) & (days < end)
-        observed |= inside
-        ends.append(int(np.flatnonzero(inside)[-1]) + 1)
+        is_in_window = (days >= begin) & (days < end)
+        observed |= is_in_window
+        window_ends.append(int(np.flatnonzero(is_in_window)[-1]) + 1)
     y = np.where(observed[:, None], arc.positions, np.nan)
     mean, covariance = filter_positions(arc, orbit, logarithms, axes, y)
     restarted = np.full((len(days), 6), np.nan)
-    for end in ends:
+    for end in window_ends:
         first, path = _from_latest(arc, end, orbit.solar)
         restarted[first:] = path
     return mean, np.diagonal(covariance, axis1=1, axis2=2), observed, restarted
@@ -189,9 +198,9 @@ def filter_positions(arc: Arc, orbit: Orbit, logarithms: np.ndarray, axes: str, 
 
     Nothing is taken to be small here: the filter follows the satellite in steps of 30 s.
     """
-    found = _filter(arc.environment, wide_start(orbit.state), jnp.asarray(y), jnp.asarray(logarithms),
+    predicted = _filter(arc.environment, wide_start(orbit.state), jnp.asarray(y), jnp.asarray(logarithms),
                     period_of(orbit.state[None]), (tuple(arc.times), axes))
-    return np.asarray(found[0]), np.asarray(found[1])
+    return np.asarray(predicted[0]), np.asarray(predicted[1])
 
 
 @functools.partial(jax.jit, static_argnums=(5,))
@@ -200,5 +209,5 @@ def _filter(environment: Environment, start: Gaussian, y: jax.Array, logarithms:
     times, axes = np.array(fixed[0]), fixed[1]
     forces, white = magnitudes.forces(logarithms, axes, period)
     system = satellite(environment, start, forces, axes, white, NOISE)
-    found = filter(system, times, y, rule=Taylor(), steps=training.steps_of(times, STEP))
-    return found.predicted_mean[:, :3], found.predicted_covariance[:, :3, :3]
+    filtered = filter(system, times, y, rule=Taylor(), steps=training.steps_of(times, STEP))
+    return filtered.predicted_mean[:, :3], filtered.predicted_covariance[:, :3, :3]

@@ -1,4 +1,4 @@
-"""A satellite as a latent force model: known gravity, and small forces that nobody measured."""
+"""A satellite as a latent force model: known gravity, and small unmeasured forces."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from lfm_ppl.orbits.geopotential import GM
 from lfm_ppl.utils import checks
 
 SOLAR_PRESSURE = 100.0
-"""Acceleration of a GPS satellite by sunlight, in nm/s^2, before anything is known of the satellite."""
+"""Prior mean of the acceleration of a GPS satellite by sunlight, in nm/s^2."""
 GPS_PERIOD = 23.9344696 / 2
-"""Hours in which a GPS satellite turns once around the Earth: half a sidereal day."""
+"""Orbital period of a GPS satellite in hours: half a sidereal day."""
 HARMONICS: dict[str, Mapping[str, Sequence[int]]] = {
     "DYB": {"solar": (1, 2, 3, 4), "panel": (1, 2, 3, 4), "remaining": (1, 2, 3, 4)},
     "RTN": {"radial": range(1, 8), "tangential": range(1, 8), "normal": range(1, 11)},
 }
-"""Axes -> force -> multiples of the base frequency. DYB: that of the orbit. RTN: half of it, for GPS once a day."""
+"""Axes -> force -> multiples of the base frequency: of the orbital frequency for DYB, of half of it for RTN."""
 STATES = ("x", "y", "z", "vx", "vy", "vz")
 START_SD = (0.1, 0.1)
-"""Of the start (km, km/h): far wider than what a few positions tell."""
+"""Prior standard deviations of position and velocity at the first time (km, km/h), much wider than the data."""
 _NEAR = 9
 
 
@@ -41,36 +41,35 @@ class Motion(eqx.Module):
     axes: str = eqx.field(static=True)
 
     def __call__(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
-        """Return the derivatives (6,) in km/h and km/h^2; the first force is that of the sunlight."""
+        """Return the derivatives (6,) in km/h and km/h^2; the first force is the sunlight."""
         return jnp.concatenate([x[3:], self.acceleration(x, u, t)])
 
     def acceleration(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
         """Return the acceleration (3,) in km/h^2."""
         r, v = x[:3], x[3:]
         total = self.environment.acceleration(r, t) + u[0] * self.environment.solar_pressure(r, t)
-        others = self.environment.sunlit_axes(r, t)[:, 1:] if self.axes == "DYB" else frames.rtn(r, v)
-        return total + NANO * others @ u[1:]
+        other_axes = self.environment.sunlit_axes(r, t)[:, 1:] if self.axes == "DYB" else frames.rtn(r, v)
+        return total + NANO * other_axes @ u[1:]
 
 
 def satellite(environment: Environment, start: Gaussian, forces: Mapping[str, Force], axes: str = "DYB",
               white: Any = 0.0, noise_sd: Any = 5e-5, units: Mapping[str, str] | None = None) -> LatentForceModel:
-    """Return a satellite pushed by unknown small forces, observed in its position.
+    """Return the model of a satellite with unknown small forces, whose position is observed.
 
         dr = v dt,    dv = (a(r, t) + u_1(t) a_solar(r, t) + R (u_2, ...)) dt + white dB,    y_k = r(t_k) + e_k,
 
-    with a(r, t) the pull of Earth, Moon and Sun, a_solar the pressure of sunlight of one nm/s^2, zero in the Earth's
-    shadow, and R the other axes: Y and B of `dyb`, lit by the Sun, or all three of `rtn`. The small forces are in
-    nm/s^2, distances in km, times in hours. Position and velocity alone enter non-linearly, so that a sigma-point rule
-    needs twelve points, however many states the forces have.
+    with a(r, t) the gravity of Earth, Moon and Sun, a_solar a solar pressure of one nm/s^2, zero in the Earth's shadow,
+    and R the other axes: Y and B of `dyb`, in sunlight, or all three of `rtn`. The small forces are in
+    nm/s^2, distances in km, times in hours. Only position and velocity enter non-linearly, so that a sigma-point rule
+    needs twelve points for any number of states of the forces.
 
     Args:
-        environment: what is known of the surroundings.
+        environment: gravity, Earth rotation, Sun and Moon.
         start: position (km) and velocity (km/h) at the first time, (6,).
-        forces: name -> force, in nm/s^2: that of the sunlight first, then one for each other axis. `small_forces`
-            gives some.
+        forces: name -> force, in nm/s^2: the sunlight first, then one for each other axis, such as `small_forces`.
         axes: "DYB" or "RTN".
         white: dispersion of white noise on the acceleration, in nm/s^2 sqrt(h).
-        noise_sd: standard deviation of a coordinate's error (km).
+        noise_sd: standard deviation of the error of a coordinate (km).
         units: name -> unit, for results and plots.
 
     Raises:
@@ -85,9 +84,9 @@ def satellite(environment: Environment, start: Gaussian, forces: Mapping[str, Fo
 def pushed(dynamics: Callable, start: Gaussian, forces: Mapping[str, Force], axes: str, white: Any, noise_sd: Any,
            units: Mapping[str, str] | None) -> LatentForceModel:
     """Return the model of a position and a velocity with these dynamics; arguments as for `satellite`."""
-    wanted = 3 if axes == "DYB" else 4
-    if len(forces) != wanted:
-        raise ValueError(f"a satellite with axes {axes} has {wanted} forces, that of the sunlight first; got "
+    force_count = 3 if axes == "DYB" else 4
+    if len(forces) != force_count:
+        raise ValueError(f"a satellite with axes {axes} has {force_count} forces, the sunlight first; got "
                          f"{list(forces)}.")
     push = jnp.concatenate([jnp.zeros((3, 3)), NANO * jnp.asarray(white) * jnp.eye(3)])
     return LatentForceModel(
@@ -109,14 +108,14 @@ def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, dr
     c_n with standard deviation amplitude / n at the start, and wander / n gained per square root of an hour.
 
     Args:
-        axes: "DYB", where f is the orbit's frequency, or "RTN", where it is half of that: once a day for GPS.
+        axes: "DYB", with f the orbital frequency, or "RTN", with half of it: once a day for GPS.
         amplitude: nm/s^2; or force -> one number for each of its multiples n, not divided by n.
         wander: nm/s^2 / sqrt(h); or force -> numbers, as amplitude.
         drift: nm/s^2 / sqrt(h); or force -> number.
         level: standard deviation of the sunlight's acceleration, and of the levels b on the other axes (nm/s^2); or
             force -> number.
         harmonics: force -> multiples of the base frequency; None: `HARMONICS`.
-        period: of the orbit (h), as `period_of` finds it; the default is that of a GPS satellite.
+        period: orbital period (h), as from `period_of`; by default of a GPS satellite.
 
     Raises:
         ValueError: unknown axes, or a period that is not positive.
@@ -127,25 +126,27 @@ def small_forces(axes: str = "DYB", amplitude: Any = 1.0, wander: Any = 0.01, dr
     """
     checks.one_of("axes", axes, tuple(HARMONICS))
     base = period if axes == "DYB" else 2 * period
-    own = level if isinstance(level, Mapping) else {}
-    sunlight, others = (0.0, 0.0) if own else level
-    found: dict[str, Force] = {}
+    levels = level if isinstance(level, Mapping) else {}
+    sunlight, other_level = (0.0, 0.0) if levels else level
+    forces: dict[str, Force] = {}
     if axes == "RTN":
-        found["solar"] = Constant(own.get("solar", sunlight), SOLAR_PRESSURE)
+        forces["solar"] = Constant(levels.get("solar", sunlight), SOLAR_PRESSURE)
     for name, multiples in (harmonics or HARMONICS[axes]).items():
         sunward = name == "solar"
         walk = drift[name] if isinstance(drift, Mapping) else drift
-        force: Force = RandomWalk(walk, own.get(name, sunlight if sunward else others),
+        force: Force = RandomWalk(walk, levels.get(name, sunlight if sunward else other_level),
                                   mean=SOLAR_PRESSURE if sunward else 0.0)
-        sizes = zip(multiples, _each(amplitude, name, multiples), _each(wander, name, multiples), strict=True)
+        sizes = zip(
+            multiples, _magnitudes(amplitude, name, multiples), _magnitudes(wander, name, multiples), strict=True
+        )
         for n, size, gain in sizes:
             force = force + Resonator(base / n, size, gain)
-        found[name] = force
-    return found
+        forces[name] = force
+    return forces
 
 
 def period_of(path: Any) -> jax.Array:
-    """Return the hours in which a satellite turns once, from the mean of the semi-major axis along its path.
+    """Return the orbital period (h) from the mean of the semi-major axis along a path.
 
         1/a = 2/|r| - |v|^2/GM,    period = 2 pi (a^3/GM)^(1/2)
 
@@ -153,7 +154,7 @@ def period_of(path: Any) -> jax.Array:
         path: (T, 6) position (km) and velocity (km/h).
 
     Raises:
-        ValueError: another shape, or a satellite so fast that it leaves the Earth.
+        ValueError: another shape, or a velocity above the escape velocity.
 
     Example:
         >>> round(float(period_of(jnp.array([[29_600.0, 0.0, 0.0, 0.0, 13_210.7, 0.0]]))), 2)  # as of Galileo
@@ -164,29 +165,29 @@ def period_of(path: Any) -> jax.Array:
     if path.ndim != 2 or path.shape[1] != 6:
         raise ValueError(f"path must have shape (times, 6), position and velocity, got {path.shape}.")
     inverse = 2.0 / jnp.linalg.norm(path[:, :3], axis=1) - (path[:, 3:] ** 2).sum(axis=1) / gm
-    known = checks.concrete(inverse)
-    if known is not None and not (known > 0).all():
-        raise ValueError("this is no orbit around the Earth: the velocity (km/h) is beyond that of escape.")
+    concrete_inverse = checks.concrete(inverse)
+    if concrete_inverse is not None and not (concrete_inverse > 0).all():
+        raise ValueError("this is no orbit around the Earth: the velocity (km/h) exceeds the escape velocity.")
     return 2.0 * jnp.pi * jnp.sqrt((1.0 / inverse).mean() ** 3 / gm)
 
 
-def _each(given: Any, name: str, multiples: Sequence[int]) -> Sequence[Any]:
+def _magnitudes(magnitude: Any, name: str, multiples: Sequence[int]) -> Sequence[Any]:
     """Return one magnitude for each multiple of a force."""
-    return given[name] if isinstance(given, Mapping) else [given / n for n in multiples]
+    return magnitude[name] if isinstance(magnitude, Mapping) else [magnitude / n for n in multiples]
 
 
 def start_near(times: Any, positions: Any) -> Gaussian:
-    """Return a wide prior of the state at the first time, around what the first nine positions say.
+    """Return a wide prior of the state at the first time, about a polynomial through nine positions.
 
-    A polynomial of degree eight goes through them. Over two hours of a GPS orbit its velocity is good to 1e-4 km/h,
-    over three to 0.01 km/h, and the standard deviations of the prior are 0.1 km and 0.1 km/h.
+    The polynomial has degree eight. Over two hours of a GPS orbit the error of its velocity is 1e-4 km/h, over three
+    hours 0.01 km/h; the standard deviations of the prior are 0.1 km and 0.1 km/h.
 
     Args:
         times: (T,) hours.
-        positions: (T, 3) km; rows with NaN are passed over.
+        positions: (T, 3) km; rows with NaN are ignored.
 
     Raises:
-        ValueError: fewer than nine positions, none at the first time, or nine of them that take more than three hours.
+        ValueError: fewer than nine positions, none at the first time, or a span above three hours.
 
     Example:
         >>> times = 0.25 * np.arange(9)
@@ -195,14 +196,14 @@ def start_near(times: Any, positions: Any) -> Gaussian:
     """
     mean, missing, reach = polynomial_state(times, positions)
     if missing or reach > 3.0:
-        raise ValueError("the start of an orbit is taken from nine positions within three hours, the first of them at "
-                         f"the first time; here {'the first one is missing' if missing else f'nine take {reach:g} h'}. "
-                         "Begin the data where the positions begin.")
+        reason = "the first position is missing" if missing else f"nine positions span {reach:g} h"
+        raise ValueError("the start of an orbit needs nine positions within three hours, the first of them at the "
+                         f"first time; {reason}. Start the data at the first position.")
     return wide_start(mean)
 
 
 def wide_start(state: Any) -> Gaussian:
-    """Return a prior about a state (6,), in km and km/h, that says little beside positions: with START_SD.
+    """Return a wide prior about a state (6,), in km and km/h, with standard deviations `START_SD`.
 
     Example:
         >>> wide_start(jnp.zeros(6)).covariance.diagonal().round(6).tolist()
@@ -212,25 +213,30 @@ def wide_start(state: Any) -> Gaussian:
 
 
 def polynomial_state(times: Any, positions: Any) -> tuple[jax.Array, bool, float]:
-    """Return the state (6,) at the first time by a polynomial through nine positions, and how far it can be trusted.
+    """Return the state (6,) at the first time from a polynomial through nine positions, with its quality.
 
     Args:
         times: (T,) hours.
-        positions: (T, 3) km; rows with NaN are passed over.
+        positions: (T, 3) km; rows with NaN are ignored.
 
     Returns:
-        The state; whether the first position is missing; how many hours after the first time the ninth one is.
+        The state; whether the first position is missing; the hours between the first time and the ninth position.
 
     Raises:
         ValueError: fewer than nine positions.
     """
     times = np.asarray(times, float)
-    known = checks.concrete(positions)
-    rows = np.arange(len(times)) if known is None else np.flatnonzero(np.isfinite(known).all(axis=1))
+    concrete_positions = checks.concrete(positions)
+    rows = (
+        np.arange(len(times))
+        if concrete_positions is None
+        else np.flatnonzero(np.isfinite(concrete_positions).all(axis=1))
+    )
     rows = rows[np.concatenate([[True], np.diff(times[rows]) > 0])][:_NEAR] if len(rows) else rows
     if len(rows) < _NEAR:
-        raise ValueError(f"the start of an orbit is taken from its first {_NEAR} positions; there are {len(rows)}.")
-    at, first = times[rows], times[0]
-    vandermonde = np.vander((at - first) / (at[-1] - first), _NEAR, increasing=True)
-    weights = np.linalg.inv(vandermonde)[:2] / np.array([[1.0], [at[-1] - first]])
-    return (jnp.asarray(weights) @ jnp.asarray(positions)[rows]).ravel(), bool(at[0] > first), float(at[-1] - first)
+        raise ValueError(f"the start of an orbit needs {_NEAR} positions; there are {len(rows)}.")
+    node_times, first = times[rows], times[0]
+    vandermonde = np.vander((node_times - first) / (node_times[-1] - first), _NEAR, increasing=True)
+    weights = np.linalg.inv(vandermonde)[:2] / np.array([[1.0], [node_times[-1] - first]])
+    state = (jnp.asarray(weights) @ jnp.asarray(positions)[rows]).ravel()
+    return state, bool(node_times[0] > first), float(node_times[-1] - first)

@@ -31,7 +31,7 @@ def read_sp3(
     Args:
         source: a folder with files ``*.sp3`` or ``*.SP3``, a file, or several files; SP3-c or SP3-d, as text or
             compressed by gzip (``*.sp3.gz``).
-        satellites: the satellites to read, such as ``["G05"]``, in this order. None: those of all files, sorted.
+        satellites: the satellites to read, such as ``["G05"]``, in this order. None: all satellites, sorted.
         tolerance: how far apart, in kilometres, two files may put a satellite at an epoch that both have. Some agencies
             write the midnight between two days into both files; the position of the earlier file is kept.
 
@@ -73,14 +73,14 @@ def read_sp3(
     files = [read_file(path, satellites) for path in _find(source)]
     files.sort(key=lambda file: (file.start, file.end))
     names = tuple(str(file.path) for file in files)
-    known = sorted({name for file in files for name in file.header.satellites})
-    chosen = check_satellites(known if satellites is None else satellites, known, names)
+    available = sorted({name for file in files for name in file.header.satellites})
+    selected = check_satellites(available if satellites is None else satellites, available, names)
     _check_alike(files)
-    positions = _connect(files, chosen, tolerance)
+    positions = _connect(files, selected, tolerance)
     interval = files[0].header.interval
     return Ephemerides(
         epochs=files[0].start + interval * np.arange(len(positions)),
-        satellites=chosen,
+        satellites=selected,
         positions=positions,
         interval=interval,
         frame=files[0].header.frame,
@@ -112,14 +112,14 @@ def _check_alike(files: list[Sp3File]) -> None:
     """Raise unless all files have the interval, the frame and the time system of the first."""
     first = files[0]
     for file in files[1:]:
-        for line, what, one, other in (
+        for line, label, expected, value in (
             (2, "interval", f"{first.header.interval:g} s", f"{file.header.interval:g} s"),
             (1, "frame", first.header.frame, file.header.frame),
             (file.header.time_system_line, "time system", first.header.time_system, file.header.time_system),
         ):
-            if one != other:
+            if expected != value:
                 raise ValueError(
-                    f"{file.path}, line {line}: the {what} is {other}, but {one} in {first.path}. "
+                    f"{file.path}, line {line}: the {label} is {value}, but {expected} in {first.path}. "
                     "Read the files that agree."
                 )
 
@@ -135,26 +135,26 @@ def _connect(files: list[Sp3File], satellites: tuple[str, ...], tolerance: float
         first = round((file.start - start) / interval)
         rows = slice(first, first + file.header.epochs)
         columns = [satellites.index(name) for name in file.satellites]
-        there, new = positions[rows, columns], file.positions
-        distance = np.linalg.norm(new - there, axis=-1)
+        stored, new = positions[rows, columns], file.positions
+        distance = np.linalg.norm(new - stored, axis=-1)
         if np.any(distance > tolerance):
             row, column = np.argwhere(distance > tolerance)[0]
-            other = files[source[first + row, columns[column]]].path
+            other_path = files[source[first + row, columns[column]]].path
             epoch = calendar(file.start + row * interval)
             raise ValueError(
                 f"{file.path}, line {file.lines[row]}: {file.satellites[column]} at {epoch} is "
-                f"{distance[row, column] * 1e5:.1f} cm from where {other} has it; "
+                f"{distance[row, column] * 1e5:.1f} cm from where {other_path} has it; "
                 f"expected at most {tolerance * 1e5:g} cm. Leave out one of the files, or set tolerance= (km) to "
                 "keep the position of the earlier one."
             )
-        positions[rows, columns] = np.where(np.isnan(there), new, there)
-        source[rows, columns] = np.where(np.isnan(there).any(axis=-1), index, source[rows, columns])
+        positions[rows, columns] = np.where(np.isnan(stored), new, stored)
+        source[rows, columns] = np.where(np.isnan(stored).any(axis=-1), index, source[rows, columns])
     return positions
 
 
 def _check_order(files: list[Sp3File]) -> None:
     """Raise unless each file begins on the epochs of the first, and no later than the ones before it end."""
-    interval, before = files[0].header.interval, files[0]
+    interval, latest = files[0].header.interval, files[0]
     for file in files[1:]:
         steps = (file.start - files[0].start) / interval
         if abs(steps - round(steps)) * interval > 1e-3:
@@ -162,9 +162,9 @@ def _check_order(files: list[Sp3File]) -> None:
                 f"{file.path}, line 1: the first epoch {calendar(file.start)} is not a whole number of intervals of "
                 f"{interval:g} s after the first of {files[0].path}, {calendar(files[0].start)}."
             )
-        if file.start > before.end + 1.5 * interval:
+        if file.start > latest.end + 1.5 * interval:
             raise ValueError(
-                f"{file.path}, line 1: begins at {calendar(file.start)}, but {before.path} ends at "
-                f"{calendar(before.end)}. Add the files in between, or read each span by itself."
+                f"{file.path}, line 1: begins at {calendar(file.start)}, but {latest.path} ends at "
+                f"{calendar(latest.end)}. Add the files in between, or read each span separately."
             )
-        before = max(before, file, key=lambda one: one.end)
+        latest = max(latest, file, key=lambda candidate: candidate.end)

@@ -1,8 +1,7 @@
 """One SP3 file: a header, and at each epoch one line per satellite, in fixed columns.
 
-The columns are those of S. Hilla, *The Extended Standard Product 3 Orbit Format (SP3-d)*, 2016, counted from 1 as they
-are there. SP3-c has the same columns with at most 85 satellites and four lines of comments, which not every agency
-keeps to.
+The columns follow S. Hilla, *The Extended Standard Product 3 Orbit Format (SP3-d)*, 2016, counted from
+1. SP3-c has the same columns with at most 85 satellites and four lines of comments, a limit that some agencies exceed.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _POSITION = re.compile(r"P...(?:[ \d-]{7}\.\d{6}){3}(?:(?: {14}|[ \d-]{7}\.[ \d]
 
 
 class Header(NamedTuple):
-    """What the lines before the first epoch say.
+    """The header: the lines before the first epoch.
 
     Attributes:
         start: the first epoch in the time system of the file, seconds since 1980-01-06 00:00:00 of that system.
@@ -38,7 +37,7 @@ class Header(NamedTuple):
         frame: the Earth-fixed frame.
         agency: who computed the orbits.
         time_system: one of :data:`TIME_SYSTEMS`.
-        time_system_line: the line that says so.
+        time_system_line: its line.
         satellites: the names listed.
         length: the number of lines of the header.
     """
@@ -55,11 +54,11 @@ class Header(NamedTuple):
 
 
 class Sp3File(NamedTuple):
-    """A file that was read to its end.
+    """A complete file.
 
     Attributes:
-        path: where it lies.
-        header: what it says of itself.
+        path: its path.
+        header: its header.
         start: the first epoch, seconds of GPS time.
         satellites: the satellites read, in the order of the header.
         positions: kilometres, shape (epochs, satellites, 3); NaN where there is none.
@@ -80,7 +79,7 @@ class Sp3File(NamedTuple):
 
 
 class _Text(NamedTuple):
-    """The lines of a file, and complaints that name them as an editor counts them."""
+    """The lines of a file, and errors with line numbers from 1."""
 
     path: Path
     lines: list[str]
@@ -88,7 +87,7 @@ class _Text(NamedTuple):
     def error(self, line: int, message: str) -> ValueError:
         return ValueError(f"{self.path}, line {line}: {message}")
 
-    def number(self, line: int, first: int, last: int, what: str) -> float:
+    def number(self, line: int, first: int, last: int, label: str) -> float:
         """Return the number in the columns ``first`` to ``last``."""
         cell = self.lines[line - 1][first - 1 : last]
         try:
@@ -96,20 +95,20 @@ class _Text(NamedTuple):
         except ValueError:
             value = np.nan
         if not np.isfinite(value):
-            raise self.error(line, f"expected {what} in columns {first} to {last}, got {cell.strip()!r}.")
+            raise self.error(line, f"expected {label} in columns {first} to {last}, got {cell.strip()!r}.")
         return value
 
-    def whole(self, line: int, first: int, last: int, what: str) -> int:
+    def integer(self, line: int, first: int, last: int, label: str) -> int:
         """Return the whole number in the columns ``first`` to ``last``."""
-        value = self.number(line, first, last, what)
+        value = self.number(line, first, last, label)
         if value != int(value):
-            raise self.error(line, f"expected {what}, a whole number, in columns {first} to {last}, got {value:g}.")
+            raise self.error(line, f"expected {label}, a whole number, in columns {first} to {last}, got {value:g}.")
         return int(value)
 
     def epoch(self, line: int) -> float:
         """Return the date in columns 4 to 31, which line 1 and the lines of the epochs share."""
-        places = ((4, 7, "a year"), (9, 10, "a month"), (12, 13, "a day"), (15, 16, "an hour"), (18, 19, "a minute"))
-        year, month, day, hour, minute = (self.whole(line, *place) for place in places)
+        columns = ((4, 7, "a year"), (9, 10, "a month"), (12, 13, "a day"), (15, 16, "an hour"), (18, 19, "a minute"))
+        year, month, day, hour, minute = (self.integer(line, *column) for column in columns)
         second = self.number(line, 21, 31, "seconds")
         try:
             return gps_seconds(year, month, day, hour, minute, second)
@@ -117,23 +116,23 @@ class _Text(NamedTuple):
             raise self.error(line, f"the date in columns 4 to 31 does not exist: {error}.") from None
 
 
-def read_file(path: Path, wanted: Container[str] | None = None) -> Sp3File:
+def read_file(path: Path, names: Container[str] | None = None) -> Sp3File:
     """Read one SP3-c or SP3-d file, as text or compressed by gzip.
 
     Args:
         path: the file.
-        wanted: the satellites to read. None: all of them.
+        names: satellites to read; None: all.
 
     Returns:
-        The positions, and what the header says.
+        The positions and the header.
 
     Raises:
-        ValueError: with file and line, where the file is not as the format wants it.
+        ValueError: the file is invalid; the message names file and line.
         FileNotFoundError: if there is no such file.
     """
     text = _Text(path, _read_lines(path))
     header = _read_header(text)
-    satellites = tuple(name for name in header.satellites if wanted is None or name in wanted)
+    satellites = tuple(name for name in header.satellites if names is None or name in names)
     positions, lines = _read_positions(text, header, satellites)
     return Sp3File(path, header, header.start + TIME_SYSTEMS[header.time_system], satellites, positions, lines)
 
@@ -165,7 +164,7 @@ def _read_header(text: _Text) -> Header:
         last = max(k for k, line in enumerate(lines, 1) if line)
         raise text.error(last, f"the file is cut: it ends with {lines[last - 1][:60]!r}, not EOF. Fetch it again.")
     length = next((k for k, line in enumerate(lines) if line[:1] == "*"), len(lines))
-    start, count = text.epoch(1), text.whole(1, 33, 39, "the number of epochs")
+    start, count = text.epoch(1), text.integer(1, 33, 39, "the number of epochs")
     if lines[1][:2] != "##":
         raise text.error(2, f"expected the line ##, with the interval, got {lines[1][:20]!r}.")
     interval = text.number(2, 25, 38, "the interval in seconds")
@@ -208,13 +207,13 @@ def _read_satellites(text: _Text, length: int) -> tuple[str, ...]:
     rows = [k for k, line in enumerate(text.lines[:length], 1) if line[:2] in ("+ ", "+")]
     if not rows:
         raise text.error(length, "the header ends without a line +, which lists the satellites.")
-    count = text.whole(rows[0], 4, 6, "the number of satellites")
+    count = text.integer(rows[0], 4, 6, "the number of satellites")
     listed = [(row, text.lines[row - 1][k : k + 3]) for row in rows for k in range(9, 60, 3)]
     names = [(row, _name(cell)) for row, cell in listed if cell[:1].isalpha()]
     if len(names) != count:
         raise text.error(rows[0], f"{count} satellites are announced, but {len(names)} are listed.")
     for k, (row, name) in enumerate(names):
-        if name in (other for _, other in names[:k]):
+        if name in (earlier for _, earlier in names[:k]):
             raise text.error(row, f"the satellite {name} is listed twice.")
     return tuple(name for _, name in names)
 
@@ -229,7 +228,7 @@ def _read_positions(text: _Text, header: Header, satellites: tuple[str, ...]) ->
     columns = {name: satellites.index(name) if name in satellites else None for name in header.satellites}
     cells: list[int] = []
     values: list[tuple[float, float, float]] = []
-    places: list[int] = []
+    line_numbers: list[int] = []
     epochs: list[int] = []
     for number, line in enumerate(text.lines[header.length :], header.length + 1):
         if line[:1] == "P":
@@ -244,7 +243,7 @@ def _read_positions(text: _Text, header: Header, satellites: tuple[str, ...]) ->
             except ValueError:
                 raise _bad_position(text, number) from None
             cells.append((len(epochs) - 1) * len(satellites) + column)
-            places.append(number)
+            line_numbers.append(number)
         elif line[:1] == "*":
             epochs.append(number)
             _check_epoch(text, header, epochs)
@@ -253,21 +252,25 @@ def _read_positions(text: _Text, header: Header, satellites: tuple[str, ...]) ->
             break
         elif line and not line.startswith(_SKIPPED):
             raise text.error(number, f"expected a line that begins with *, P, V, EP, EV or EOF, got {line[:20]!r}.")
-    return _positions(text, (header.epochs, len(satellites)), cells, values, places), epochs
+    return _positions(text, (header.epochs, len(satellites)), cells, values, line_numbers), epochs
 
 
 def _positions(
-    text: _Text, shape: tuple[int, int], cells: list[int], values: list[tuple[float, float, float]], places: list[int]
+    text: _Text,
+    shape: tuple[int, int],
+    cells: list[int],
+    values: list[tuple[float, float, float]],
+    line_numbers: list[int],
 ) -> np.ndarray:
     """Return the values (epochs, satellites, 3) that were read at the lines ``places``, NaN where there is none."""
-    found = np.array(values).reshape(-1, 3)
+    coordinates = np.array(values).reshape(-1, 3)
     _, first = np.unique(cells, return_index=True)
     if len(first) < len(cells):
-        line = places[min(set(range(len(cells))) - set(first.tolist()))]
+        line = line_numbers[min(set(range(len(cells))) - set(first.tolist()))]
         raise text.error(line, f"a second position of {_name(text.lines[line - 1][1:4])} at the same epoch.")
-    found[(found == 0).all(axis=1) | (np.abs(found) >= ABSENT).any(axis=1)] = np.nan
+    coordinates[(coordinates == 0).all(axis=1) | (np.abs(coordinates) >= ABSENT).any(axis=1)] = np.nan
     positions = np.full((shape[0] * shape[1], 3), np.nan)
-    positions[np.array(cells, dtype=int)] = found
+    positions[np.array(cells, dtype=int)] = coordinates
     return positions.reshape(*shape, 3)
 
 
@@ -280,7 +283,7 @@ def _listed(text: _Text, line: int, columns: dict[str, int | None]) -> int | Non
 
 
 def _bad_position(text: _Text, line: int) -> ValueError:
-    """Return the complaint about a line that is not a position."""
+    """Return the error of a line that is not a position."""
     length = len(text.lines[line - 1])
     if length < 46:
         return text.error(line, f"the line is cut after column {length}; a position ends in column 46.")
@@ -297,7 +300,7 @@ def _bad_position(text: _Text, line: int) -> ValueError:
 
 
 def _check_epoch(text: _Text, header: Header, epochs: list[int]) -> None:
-    """Raise unless the last of ``epochs`` is where line 1 and the interval put it."""
+    """Raise ValueError unless the last of ``epochs`` follows from line 1 and the interval."""
     if len(epochs) > header.epochs:
         raise text.error(epochs[-1], f"an epoch more than the {header.epochs} of line 1.")
     if extra := text.lines[epochs[-1] - 1][31:]:
@@ -313,7 +316,7 @@ def _check_epoch(text: _Text, header: Header, epochs: list[int]) -> None:
 
 
 def _check_end(text: _Text, header: Header, line: int, epochs: int) -> None:
-    """Raise unless all epochs came before the EOF in ``line``, and nothing comes after it."""
+    """Raise ValueError unless all epochs precede the EOF in ``line``, and nothing follows it."""
     if epochs < header.epochs:
         raise text.error(line, f"EOF after {epochs} of the {header.epochs} epochs of line 1; the file is not complete.")
     for number, extra in enumerate(text.lines[line:], line + 1):

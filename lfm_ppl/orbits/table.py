@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 
-class Table(eqx.Module):
+class TimeTable(eqx.Module):
     """A function of time given at equally spaced times, cubic between them.
 
     Between two nodes it is the polynomial of degree three through the four nearest ones, whose error is at most
@@ -27,7 +27,7 @@ class Table(eqx.Module):
     Example:
         >>> import numpy as np
         >>> hours = np.arange(0.0, 10.0)
-        >>> table = Table(0.0, 1.0, hours[:, None] ** 3)
+        >>> table = TimeTable(0.0, 1.0, hours[:, None] ** 3)
         >>> float(table(2.5)[0])
         15.625
     """
@@ -46,10 +46,10 @@ class Table(eqx.Module):
 
     def __call__(self, t: Any) -> jax.Array:
         """Return the values (C,) at time ``t``."""
-        place = (t - self.start) / self.spacing
-        first = jnp.clip(jnp.floor(place).astype(int) - 1, 0, self.values.shape[0] - 4)
+        position = (t - self.start) / self.spacing
+        first = jnp.clip(jnp.floor(position).astype(int) - 1, 0, self.values.shape[0] - 4)
         rows = jax.lax.dynamic_slice_in_dim(self.values, first, 4)
-        x = place - first
+        x = position - first
         weights = jnp.stack([-(x - 1) * (x - 2) * (x - 3) / 6, x * (x - 2) * (x - 3) / 2,
                              -x * (x - 1) * (x - 3) / 2, x * (x - 1) * (x - 2) / 6])
         return (weights[:, None] * rows).sum(0)

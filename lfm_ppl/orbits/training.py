@@ -1,14 +1,15 @@
-"""The training of a satellite as a linear regression, in which the magnitudes of the small forces are quick to change.
+"""The training of a satellite as a linear regression, for which the magnitudes of the small forces change quickly.
 
-Departures from an orbit are linear in the joint state s_0 at the first time and in the noise that drives the forces,
-and neither response depends on the magnitudes. So the positions, all in one vector, are
+1. Departures from an orbit are linear in the joint state s_0 at the first time and in the noise that drives the forces.
+   Neither response depends on the magnitudes.
+2. The positions, all in one vector, are therefore
 
-    y = m + O S s_0 + e,    s_0 ~ N(0, I),    e ~ N(0, sum_j q_j^2 K_j + NOISE^2 I),
+       y = m + O S s_0 + e,    s_0 ~ N(0, I),    e ~ N(0, sum_j q_j^2 K_j + NOISE^2 I),
 
-with m what the forces' means make, S the standard deviations at the start and q the noises. m, O and K_j come from the
-affine maps of the filter. What follows is algebra with matrices of 3 T rows: six to ten times as fast as the filter for
-three days, as fast for nine, since it is cubic in T, and K, quadratic in it, takes 24 MB for the first and 215 for the
-second.
+   with m the response to the means of the forces, S the standard deviations at the start and q the noises.
+3. m, O and K_j come from the affine maps of the filter, once.
+4. Densities are algebra with matrices of 3 T rows: six to ten times as fast as the filter for three days, as fast for
+   nine, since the cost is cubic in T. K takes 24 MB for three days and 215 MB for nine.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from lfm_ppl.utils.gaussian_residuals import masked
 from lfm_ppl.utils.linalg import matmul, solve_lower
 
 _LONGEST = 0.5
-"""Hours from one position to the next in learning; closer ones say the same."""
+"""Hours between positions in learning; closer positions add little information."""
 _LARGEST = 60.0
 """Logarithm of a magnitude that counts as infinite: a force of 1e26 nm/s^2."""
 _STEP = 0.25
@@ -56,10 +57,10 @@ class Training(NamedTuple):
     """The training as departures from an orbit.
 
     Attributes:
-        near: the orbit, at these times.
+        neighbourhood: the orbit, at these times.
         times: (T,) hours.
         y: (T, 3) km, NaN where missing.
-        axes: of the small forces.
+        axes: axes of the small forces.
         mean: (3 T,), m, the expected departures.
         start: (3 T, n), the response O of all positions to the joint state at the first time: position and velocity,
             the levels of all axes, then two states for each resonator.
@@ -67,7 +68,7 @@ class Training(NamedTuple):
             acceleration, the drifts of the levels that have one, then the noise of each resonator.
     """
 
-    near: Neighbourhood
+    neighbourhood: Neighbourhood
     times: np.ndarray
     y: np.ndarray
     axes: str
@@ -81,23 +82,23 @@ class Training(NamedTuple):
         interval = float(arc.times[1] - arc.times[0])
         thin = max(1, int(_LONGEST / interval + 1e-9))
         times = arc.times[:arc.train:thin]
-        near = Neighbourhood.of(arc.environment, orbit, times, axes, nodes=2 * steps_of(times))
-        y = arc.positions[:arc.train:thin] - np.asarray(near.path[:, :3])
-        return cls.along(near, times, y, axes)
+        neighbourhood = Neighbourhood.of(arc.environment, orbit, times, axes, nodes=2 * steps_of(times))
+        y = arc.positions[:arc.train:thin] - np.asarray(neighbourhood.path[:, :3])
+        return cls.along(neighbourhood, times, y, axes)
 
     @classmethod
-    def along(cls, near: Neighbourhood, times: np.ndarray, y: np.ndarray, axes: str) -> Training:
+    def along(cls, neighbourhood: Neighbourhood, times: np.ndarray, y: np.ndarray, axes: str) -> Training:
         """Return the training on these departures y (T, 3)."""
-        return cls(near, times, y, axes, *_responses(near, times, axes))
+        return cls(neighbourhood, times, y, axes, *_responses(neighbourhood, times, axes))
 
     @property
     def regression(self) -> Regression:
-        """What the densities of positions depend on."""
+        """The arrays that densities of positions depend on."""
         return Regression(self.start, self.noise, jnp.asarray(self.y) - self.mean.reshape(-1, 3))
 
 
 class Regression(NamedTuple):
-    """The part of `Training` that compiled code takes, and the positions (T, 3) less their mean."""
+    """The arrays of `Training` for compiled code, and the positions (T, 3) minus their mean."""
 
     start: jax.Array
     noise: jax.Array
@@ -109,31 +110,24 @@ def steps_of(times: np.ndarray, step: float = _STEP) -> int:
     return max(1, int(np.ceil((times[1] - times[0]) / step - 1e-9)))
 
 
-def departing(logarithms: jax.Array, near: Neighbourhood, axes: str) -> LatentForceModel:
+def departing(logarithms: jax.Array, neighbourhood: Neighbourhood, axes: str) -> LatentForceModel:
     """Return the model of departures with these magnitudes."""
-    forces, white = magnitudes.forces(logarithms, axes, near.period)
-    return departure(near, forces, white, NOISE)
+    forces, white = magnitudes.forces(logarithms, axes, neighbourhood.period)
+    return departure(neighbourhood, forces, white, NOISE)
 
 
-class _Members(NamedTuple):
-    """The forces of which the small ones are sums, each with the index of its axis."""
-
-    levels: list[tuple[int, Any]]
-    resonators: list[tuple[int, Any]]
-
-
-def _members(forces: dict[str, Force]) -> _Members:
-    found = _Members([], [])
-    for axis, force in enumerate(forces.values()):
-        for one in force.forces if isinstance(force, Sum) else (force,):
-            (found.resonators if isinstance(one, Resonator) else found.levels).append((axis, one))
-    return found
+def _terms(forces: dict[str, Force]) -> tuple[list[tuple[int, Any]], list[tuple[int, Any]]]:
+    """Return the levels and the resonators of which the small forces are sums, each with the index of its axis."""
+    terms = [(axis, term) for axis, force in enumerate(forces.values())
+             for term in (force.forces if isinstance(force, Sum) else (force,))]
+    resonators = [(axis, term) for axis, term in terms if isinstance(term, Resonator)]
+    return [(axis, term) for axis, term in terms if not isinstance(term, Resonator)], resonators
 
 
 def scales(logarithms: jax.Array, axes: str) -> tuple[jax.Array, jax.Array]:
     """Return the standard deviations S (n,) at the first time, and the noises q (J,), in the order of `Training`."""
     forces, white = magnitudes.forces(logarithms, axes, period=1.0)  # sizes do not depend on it
-    levels, resonators = _members(forces)
+    levels, resonators = _terms(forces)
     start = [*np.repeat(START_SD, 3)]
     start += [force.initial_sd if isinstance(force, RandomWalk) else force.scale for _, force in levels]
     start += [force.scale for _, force in resonators for _ in range(2)]
@@ -141,52 +135,55 @@ def scales(logarithms: jax.Array, axes: str) -> tuple[jax.Array, jax.Array]:
     return jnp.stack(start), jnp.stack([white, *drifts, *(force.noise for _, force in resonators)])
 
 
-def _responses(near: Neighbourhood, times: np.ndarray, axes: str) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return m, O and K of `Training`: those of one force at a time, as forces do not see one another."""
-    levels, resonators = _members(magnitudes.forces(jnp.asarray(magnitudes.wide(axes).mean), axes, near.period)[0])
-    along = np.eye(len(near.on_orbit))
+def _responses(neighbourhood: Neighbourhood, times: np.ndarray, axes: str) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return m, O and K of `Training`, one force at a time: forces do not interact."""
+    levels, resonators = _terms(
+        magnitudes.forces(jnp.asarray(magnitudes.wide(axes).mean), axes, neighbourhood.period)[0]
+    )
+    along = np.eye(len(neighbourhood.on_orbit))
     fixed = tuple(times)
     # White noise goes first, with a level that does not drift.
     noises = np.array([0.0, *(1.0 for _ in levels)])
-    by_level, level_noise = _response(near, along[[0, *(axis for axis, _ in levels)]], None, noises, 1.0 - noises,
-                                      fixed)
+    by_level, level_noise = _response(
+        neighbourhood, along[[0, *(axis for axis, _ in levels)]], None, noises, 1.0 - noises, fixed
+    )
     periods = np.array([float(force.period) for _, force in resonators])
-    by_resonator, resonator_noise = _response(near, along[[axis for axis, _ in resonators]], periods,
+    by_resonator, resonator_noise = _response(neighbourhood, along[[axis for axis, _ in resonators]], periods,
                                               np.ones(len(periods)), np.zeros(len(periods)), fixed)
     start = [by_level[0, :, :6], *by_level[1:, :, 6:], *by_resonator[:, :, 6:]]
     drifting = [index for index, (_, force) in enumerate(levels, 1) if isinstance(force, RandomWalk)]
-    # A level responds to its mean, less what pushes on the orbit already, as it does to its first state.
-    means = jnp.stack([force.mean_at(times[0]) - near.on_orbit[axis] for axis, force in levels])
+    # A level responds to its mean, minus the force of the orbit, as to its first state.
+    means = jnp.stack([force.mean_at(times[0]) - neighbourhood.on_orbit[axis] for axis, force in levels])
     return (jnp.tensordot(means, by_level[1:, :, 6], axes=1), jnp.concatenate(start, axis=1),
             jnp.concatenate([level_noise[np.array([0, *drifting])], resonator_noise]))
 
 
 @functools.partial(jax.jit, static_argnums=(5,))
-def _response(near: Neighbourhood, axes: jax.Array, periods: jax.Array | None, noises: jax.Array,
+def _response(neighbourhood: Neighbourhood, axes: jax.Array, periods: jax.Array | None, noises: jax.Array,
               whites: jax.Array, times: tuple) -> tuple[jax.Array, jax.Array]:
     """Return, for several forces of unit magnitude, the responses (K, 3 T, n) and the covariances (K, 3 T, 3 T).
 
     Args:
-        near: the orbit.
+        neighbourhood: the orbit.
         axes: (K, R), directions of the forces.
         periods: (K,) of resonators; None: levels.
         noises: (K,) of the forces.
         whites: (K,) of the acceleration.
         times: hours.
     """
-    at = np.array(times)
+    time_array = np.array(times)
 
-    def one(inputs: tuple) -> tuple[jax.Array, jax.Array]:
+    def respond(inputs: tuple) -> tuple[jax.Array, jax.Array]:
         axis, period, noise, white = inputs
         force = RandomWalk(noise, 1.0) if period is None else Resonator(period, 1.0, noise)
         push = jnp.concatenate([jnp.zeros((3, 3)), NANO * white * jnp.eye(3)])
         system = LatentForceModel(
-            lambda x, u, t: near(x, near.on_orbit + axis * u[0], t), {"force": force},
+            lambda x, u, t: neighbourhood(x, neighbourhood.on_orbit + axis * u[0], t), {"force": force},
             GaussianObservation(lambda x, u, t: x[:3], jnp.ones(3)), Gaussian(jnp.zeros(6), jnp.eye(6)),
             process_noise=push)
-        return _position_covariances(system, at)
+        return _position_covariances(system, time_array)
 
-    return jax.lax.map(one, (axes, periods, noises, whites))
+    return jax.lax.map(respond, (axes, periods, noises, whites))
 
 
 def _position_covariances(system: LatentForceModel, times: np.ndarray) -> tuple[jax.Array, jax.Array]:
@@ -212,14 +209,14 @@ def _position_covariances(system: LatentForceModel, times: np.ndarray) -> tuple[
 
 
 class _Whitened(NamedTuple):
-    """Some entries of the positions with the noise's covariance divided out.
+    """The first entries of the positions, whitened by the covariance of the noise.
 
     Attributes:
-        chol: root of the covariance.
-        present: which entries there are.
-        start: O S in units of the root.
-        y: and the entries.
-        usable: whether all of this can be computed; if not, it is that of other numbers.
+        chol: Cholesky factor L of the covariance.
+        present: whether an entry is observed.
+        start: L^-1 O S.
+        y: L^-1 y.
+        usable: whether L exists; if not, the factor of the identity takes its place.
     """
 
     chol: jax.Array
@@ -230,13 +227,13 @@ class _Whitened(NamedTuple):
 
 
 def _root(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the Cholesky factor, and whether there is one; if not, that of the identity, for finite gradients."""
+    """Return the Cholesky factor and whether it exists; if not, the identity, for finite gradients."""
     usable = jnp.isfinite(jnp.linalg.cholesky(jax.lax.stop_gradient(matrix))).all()
     return jnp.linalg.cholesky(jnp.where(usable, matrix, jnp.eye(len(matrix)))), usable
 
 
 def _moments(logarithms: jax.Array, data: Regression, axes: str) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return O S (3 T, n), the covariance of the noise (3 T, 3 T), and whether the magnitudes are numbers."""
+    """Return O S (3 T, n), the covariance of the noise (3 T, 3 T), and whether the magnitudes are finite."""
     usable = (logarithms < _LARGEST).all()
     start, noise = scales(jnp.where(usable, logarithms, 0.0), axes)
     return data.start * start, jnp.tensordot(noise**2, data.noise, axes=1), usable
@@ -248,8 +245,8 @@ def _whitened(data: Regression, start: jax.Array, covariance: jax.Array, count: 
     present = jnp.isfinite(y)
     y, covariance = masked(y, covariance[:count, :count] + NOISE**2 * jnp.eye(count), present)
     chol, usable = _root(covariance)
-    known = jnp.concatenate([start[:count], y[:, None]], axis=1)
-    solved = solve_triangular(chol, jnp.where(present[:, None], known, 0.0), lower=True)
+    columns = jnp.concatenate([start[:count], y[:, None]], axis=1)
+    solved = solve_triangular(chol, jnp.where(present[:, None], columns, 0.0), lower=True)
     return _Whitened(chol, present, solved[:, :-1], solved[:, -1], usable)
 
 
@@ -257,16 +254,16 @@ def log_likelihood(logarithms: jax.Array, data: Regression, axes: str) -> jax.Ar
     """Return the log density of all positions; -inf, with gradient zero, where it cannot be computed."""
     start, covariance, usable = _moments(logarithms, data, axes)
     white = _whitened(data, start, covariance, data.y.size)
-    root, found = _root(jnp.eye(start.shape[1]) + white.start.T @ white.start)
+    root, is_factorised = _root(jnp.eye(start.shape[1]) + white.start.T @ white.start)
     state = solve_triangular(root, solve_triangular(root, white.start.T @ white.y, lower=True), lower=True, trans=1)
-    left = white.y - white.start @ state
-    value = (gaussian_residuals.log_density(left, white.chol, white.present)
+    residual = white.y - white.start @ state
+    value = (gaussian_residuals.log_density(residual, white.chol, white.present)
              + gaussian_residuals.log_density(state, root, jnp.zeros(state.shape)))
-    return jnp.where(usable & white.usable & found, value, -jnp.inf)
+    return jnp.where(usable & white.usable & is_factorised, value, -jnp.inf)
 
 
 def held_out(logarithms: jax.Array, data: Regression, axes: str) -> jax.Array:
-    """Return the mean log density of a position that is predicted: from the first third, plus from two thirds.
+    """Return the mean log density of a predicted position: from the first third, plus from two thirds.
 
     Where it cannot be computed it is -inf, with gradient zero.
     """
@@ -274,24 +271,24 @@ def held_out(logarithms: jax.Array, data: Regression, axes: str) -> jax.Array:
     count = len(data.y)
     folds = count // 3, 2 * count // 3
     white = _whitened(data, start, covariance, 3 * folds[-1])
-    known = jnp.isfinite(data.y).all(axis=1)
+    is_observed = jnp.isfinite(data.y).all(axis=1)
     early = 3 * folds[0]
     across = solve_triangular(white.chol, jnp.where(white.present[:, None], covariance[:3 * folds[-1], early:], 0.0),
                               lower=True)
-    own = jnp.moveaxis(jnp.diagonal(covariance.reshape(count, 3, count, 3), axis1=0, axis2=2), 2, 0)
+    own_covariance = jnp.moveaxis(jnp.diagonal(covariance.reshape(count, 3, count, 3), axis1=0, axis2=2), 2, 0)
     total, usable = jnp.zeros(()), usable & white.usable
     for seen in folds:  # what is seen first is whitened alike in both
         some = slice(None, 3 * seen)
         later, first, y = across[some, 3 * seen - early:], white.start[some], white.y[some]
-        root, found = _root(jnp.eye(start.shape[1]) + first.T @ first)
-        left = solve_triangular(root, (start[3 * seen:] - later.T @ first).T, lower=True)
-        mean = later.T @ y + left.T @ solve_triangular(root, first.T @ y, lower=True)
-        reduced, added = (part.reshape(-1, count - seen, 3) for part in (later, left))
-        held_out_covariance = (own[seen:] - jnp.einsum("mti,mtj->tij", reduced, reduced)
+        root, is_factorised = _root(jnp.eye(start.shape[1]) + first.T @ first)
+        state_factor = solve_triangular(root, (start[3 * seen:] - later.T @ first).T, lower=True)
+        mean = later.T @ y + state_factor.T @ solve_triangular(root, first.T @ y, lower=True)
+        reduced, added = (part.reshape(-1, count - seen, 3) for part in (later, state_factor))
+        held_out_covariance = (own_covariance[seen:] - jnp.einsum("mti,mtj->tij", reduced, reduced)
                                + jnp.einsum("mti,mtj->tij", added, added))
-        error = jnp.where(known[seen:, None], data.y[seen:], 0.0) - mean.reshape(-1, 3)
-        density = jnp.where(known[seen:], log_density(error, held_out_covariance), 0.0)
-        total, usable = total + density.sum() / jnp.maximum(known[seen:].sum(), 1), usable & found
+        error = jnp.where(is_observed[seen:, None], data.y[seen:], 0.0) - mean.reshape(-1, 3)
+        density = jnp.where(is_observed[seen:], log_density(error, held_out_covariance), 0.0)
+        total, usable = total + density.sum() / jnp.maximum(is_observed[seen:].sum(), 1), usable & is_factorised
     return jnp.where(usable & jnp.isfinite(total), total, -jnp.inf)
 
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import xarray as xr
 
@@ -20,7 +19,7 @@ from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding, run_record
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.approximation import more_iterations
-from lfm_ppl.results.likelihoods import PosteriorDraws, Reference
+from lfm_ppl.results.likelihoods import LikelihoodProblem, Reference, ReferenceSettings
 from lfm_ppl.results.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.results.scalars import choose, scalar_draws
 from lfm_ppl.results.verdict import NOISE_SD, Findings, judge
@@ -58,7 +57,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         draws: number of posterior draws to compare at, spread evenly over the chains.
         particles: in each run of the particle filter; by default as many as keep the noise low.
         replicates: runs of the particle filter for each draw, at least 2.
-        steps: integration steps of the reference between two observations; by default those of the fit.
+        steps: integration steps of the reference between two observations; by default as in the fit.
         model_kwargs: keyword arguments of the model, as in the fit.
         seed: of the particle filter.
         progress: write to standard error how far it is.
@@ -97,7 +96,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
             checks.positive_integer(name, value)
     checks.positive_integer("replicates", replicates)
     if replicates < 2:
-        raise ValueError("replicates must be at least 2: the noise of the particle filter is told from their spread.")
+        raise ValueError("replicates must be at least 2: their spread estimates the noise of the particle filter.")
     _check_sampler(result)
     full_problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs)
     if full_problem.example.constraints_in_words:
@@ -116,14 +115,15 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
             "draws of the result": run_record.digest(*full_problem.draws.values()),
         }, resume)  # fmt: skip
     with checkpoints.closing(run):
-        problem = full_problem.at(rows)._replace(parts=None if run is None else run.batches)
-        report = _report(result, problem, draw_index, kind, particles, replicates, steps, seed, progress)
+        problem = full_problem.select(rows)._replace(stores=None if run is None else run.batches)
+        settings = ReferenceSettings(kind, particles, replicates, steps, seed, progress)
+        report = _report(result, problem, draw_index, settings)
     arviz_data.add_group(result, GROUP, report.to_dataset())
     return report
 
 
-def _report(result: Any, problem: PosteriorDraws, draw_index: np.ndarray, kind: str, particles: int | None,
-            replicates: int, steps: int | None, seed: int, progress: bool) -> AccuracyReport:
+def _report(result: Any, problem: LikelihoodProblem, draw_index: np.ndarray,
+            settings: ReferenceSettings) -> AccuracyReport:
     posterior = arviz_data.group(result, "posterior")
     shape = (posterior.sizes["chain"], len(draw_index))
     filtered = likelihoods.gaussian(problem).reshape(shape)
@@ -133,12 +133,12 @@ def _report(result: Any, problem: PosteriorDraws, draw_index: np.ndarray, kind: 
     if (refinement := more_iterations(problem.example)) is not None:
         refined = problem._replace(bound=problem.bound.approximate(**refinement.settings))
         iterated = likelihoods.gaussian(refined, "log likelihoods with more iterations").reshape(shape)
-    reference_values = _reference(kind, problem, filtered, particles, replicates, steps, seed, progress)
+    reference_values = _reference(problem, filtered, settings)
     return assess(result, draw_index, filtered, doubled, reference_values, problem, iterated)
 
 
 def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
-           problem: PosteriorDraws, iterated: np.ndarray | None = None) -> AccuracyReport:
+           problem: LikelihoodProblem, iterated: np.ndarray | None = None) -> AccuracyReport:
     """Return the report from log likelihoods at draws.
 
     Args:
@@ -269,12 +269,10 @@ def _noisy(ssm: StateSpaceModel) -> bool:
     return callable(noise) or (noise is not None and bool(np.any(np.asarray(noise))))
 
 
-def _reference(kind: str, problem: PosteriorDraws, filtered: np.ndarray, particles: int | None, replicates: int,
-               steps: int | None, seed: int, progress: bool) -> Reference:
-    if kind == "none":
+def _reference(problem: LikelihoodProblem, filtered: np.ndarray, settings: ReferenceSettings) -> Reference:
+    if settings.kind == "none":
         return Reference(filtered.reshape(-1, 1), f"{EXACT}: for this linear model the Gaussian filter is exact")
-    if kind == "grid":
-        return likelihoods.on_grid(problem, steps, progress)
+    if settings.kind == "grid":
+        return likelihoods.on_grid(problem, settings)
     return likelihoods.by_particles(
-        problem, particles, replicates, steps, jax.random.key(seed), progress,
-        lambda estimates: noise(importance.average(estimates)), NOISE_SD, _MOST_WORK)
+        problem, settings, lambda estimates: noise(importance.average(estimates)), NOISE_SD, _MOST_WORK)

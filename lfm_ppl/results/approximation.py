@@ -29,7 +29,7 @@ from lfm_ppl.inference.posterior import evenly_spaced
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.resolution import resolution_messages
 from lfm_ppl.results import likelihoods
-from lfm_ppl.results.likelihoods import PosteriorDraws
+from lfm_ppl.results.likelihoods import LikelihoodProblem
 from lfm_ppl.utils import checks
 
 _DRAWS = 20
@@ -93,7 +93,7 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
         return []
     count = len(next(iter(draws.values())))
     _, rows = evenly_spaced(1, count, min(_DRAWS, count))
-    problem = PosteriorDraws(bound, draws).at(rows)
+    problem = LikelihoodProblem(bound, draws).select(rows)
     fitted = likelihoods.gaussian(problem) if log_likelihood is None else log_likelihood[rows]
 
     def change(*selected: Refinement) -> float:

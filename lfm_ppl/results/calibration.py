@@ -67,7 +67,7 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
         method: "vectorized", the data sets of a task side by side, or "sequential", one after the other. Side by side
             all of them wait for whichever takes longest, at each step: for its tree with NUTS, and for its sites with
             an observation family or constraints. None: sequential for the latter, vectorized otherwise.
-        folder: where the ranks of each task are stored, so that a run that was stopped goes on; None: nowhere.
+        folder: storage of the ranks of each task, from which a stopped run resumes; None: no storage.
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
         workers: what computes; see `lfm_ppl.parallel.run.run_tasks`.
@@ -141,22 +141,25 @@ class _Ranks:
         site = likelihood_site(model, (times,), {}, jax.random.key(0))
         bound = bind(model, times, jnp.zeros_like(site.observed))
 
-        def one(keys: tuple[jax.Array, jax.Array]) -> dict[str, jax.Array]:
+        def rank_statistics(keys: tuple[jax.Array, jax.Array]) -> dict[str, jax.Array]:
             trace = handlers.trace(handlers.seed(model, keys[0])).get_trace(times)
             y = trace[site.name]["value"]
             truth = {name: trace[name]["value"] for name in bound.sites}
             posterior = _chain(self.kernel(model), (times, y), keys[1], self.draws, self.thin, self.warmup)
-            score = lambda theta: bound.likelihood(theta, y).log_prob(y).sum()  # noqa: E731
+
+            def score(theta: dict[str, jax.Array]) -> jax.Array:
+                return bound.likelihood(theta, y).log_prob(y).sum()
+
             truth[LOG_LIKELIHOOD] = score(truth)
             posterior[LOG_LIKELIHOOD] = jax.lax.map(score, posterior)
             return {n: (posterior[n] < truth[n]).sum(0) for n in truth}
 
-        # One data set in a batch of its own would take both branches of each condition.
+        # jax.lax.map with a batch size would evaluate both branches of each condition.
         side_by_side = self.batch > 1 and self._method(site.example) == "vectorized"
-        return jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=self.batch if side_by_side else None))
+        return jax.jit(lambda keys: jax.lax.map(rank_statistics, keys, batch_size=self.batch if side_by_side else None))
 
     def _method(self, likelihood: SeriesLikelihood) -> str:
-        """Return how the data sets of a task run: a search that ends when it has converged is one by one."""
+        """Return how the data sets of a task run: sequentially if sites take different numbers of iterations."""
         return self.method or ("sequential" if likelihood.has_sites else "vectorized")
 
     def __call__(self, task: Task) -> dict[str, np.ndarray]:
@@ -235,7 +238,7 @@ def p_values(rank: np.ndarray, draws: int, bins: int = 16) -> dict[str, float]:
 
 
 def save(calibration: Calibration, path: str | Path, overwrite: bool = False) -> Path:
-    """Write ranks to an .npz file, whole or not at all, and return its path; an existing file is kept unless said."""
+    """Write ranks to an .npz file, atomically, and return its path."""
     path = Path(path).with_suffix(".npz")
     with atomic_write(path, overwrite) as temporary:
         np.savez(temporary, draws=np.asarray(calibration.draws), **calibration.ranks)  # type: ignore[arg-type]

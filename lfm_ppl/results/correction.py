@@ -27,7 +27,7 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
     """Return the corrected posterior: equally weighted draws, resampled by the weights of the accuracy report.
 
     Draws that the weights favour appear more than once, so that diagnostics of chains say nothing here; the report
-    gives the effective number of draws. Trajectories are new: those of the Gaussian smoother at the corrected
+    gives the effective number of draws. Trajectories are drawn again by the Gaussian smoother at the corrected
     parameters.
 
     Args:
@@ -58,7 +58,7 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
     draw_index = np.searchsorted(posterior["draw"].values, report.dataset["draw"].values)
     of_all = (np.arange(chains)[:, None] * posterior.sizes["draw"] + draw_index).ravel()
     picked = of_all[importance.resample(report.log_weight, chains * size, seed)].reshape(chains, size)
-    groups = {"posterior": _taken(posterior, picked)}
+    groups = {"posterior": _select_draws(posterior, picked)}
     groups |= {name: arviz_data.group(result, name) for name in _KEPT if arviz_data.has_group(result, name)}
     if trajectory_draws and arviz_data.has_group(result, "trajectories"):
         groups |= _paths(result, numpyro_model, times, y, model_kwargs, picked, trajectory_draws, seed)
@@ -69,8 +69,8 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
     return arviz_data.build(groups, attrs)
 
 
-def _taken(posterior: xr.Dataset, picked: np.ndarray) -> xr.Dataset:
-    """Return draws ``picked`` (C, S), which count through all chains, as chains of their own."""
+def _select_draws(posterior: xr.Dataset, picked: np.ndarray) -> xr.Dataset:
+    """Return the draws ``picked`` (C, S), indices into all chains joined, as chains."""
     chain, draw = np.divmod(picked, posterior.sizes["draw"])
     index = {"chain": xr.DataArray(chain, dims=("to_chain", "to_draw")),
              "draw": xr.DataArray(draw, dims=("to_chain", "to_draw"))}
@@ -81,19 +81,19 @@ def _taken(posterior: xr.Dataset, picked: np.ndarray) -> xr.Dataset:
 
 def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwargs: Mapping[str, Any] | None,
            picked: np.ndarray, count: int, seed: int) -> dict[str, xr.Dataset]:
-    """Draw trajectories at some of the picked draws, laid out as those of ``result``."""
+    """Draw trajectories at some of the picked draws, in the layout of ``result``."""
     templates = {name: arviz_data.group(result, name) for name in _DRAWN if arviz_data.has_group(result, name)}
     template = templates["trajectories"]
     path_times = template["at"].values if "at" in template.coords else None
     draw_index, rows = evenly_spaced(picked.shape[0], picked.shape[1], count)
-    problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs).at(picked.ravel()[rows])
+    problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs).select(picked.ravel()[rows])
     paths = {label: values.reshape(picked.shape[0], len(draw_index), *values.shape[1:]) for label, values in
              trajectories(jax.random.key(seed), problem.bound, problem.draws, path_times).items()}
     groups = {}
     for name, old in templates.items():
         variables = {}
         for label, variable in old.data_vars.items():
-            if "draw" not in variable.dims or label == "deterministics":  # made anew below
+            if "draw" not in variable.dims or label == "deterministics":  # computed again below
                 continue
             kind = _KINDS[str(label)] if name == "trajectories" else "y"
             variables[label] = (variable.transpose("chain", "draw", ...).dims, paths[kind], variable.attrs)

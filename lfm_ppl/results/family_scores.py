@@ -40,7 +40,7 @@ def log_densities(bound: BoundModel, draws: Mapping[str, Any], predicted: xr.Dat
     w = _inputs(predicted, y.shape[:-1])
     count = len(w)
 
-    def one(distribution: SeriesLikelihood, w: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
+    def series_log_prob(distribution: SeriesLikelihood, w: jax.Array, y: jax.Array, times: jax.Array) -> jax.Array:
         ssm = distribution.ssm
         family = ssm.model.observation
         assert isinstance(family, ObservationFamily)
@@ -58,7 +58,7 @@ def log_densities(bound: BoundModel, draws: Mapping[str, Any], predicted: xr.Dat
         distribution = bound.likelihood(values, data)
         if isinstance(distribution, Panel):
             times = jnp.broadcast_to(times, (y.shape[0], *times.shape))
-        return map_series(distribution, one, w, y, times)
+        return map_series(distribution, series_log_prob, w, y, times)
 
     log_densities = map_draws(bound, ("log densities", y.shape), per_draw,
                       {**draws, _PATH: w, _VALUES: np.broadcast_to(y, (count, *y.shape)),

@@ -120,7 +120,7 @@ def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figur
         Section("summary", "Parameters", _summary(result)),
         Section("accuracy", "Accuracy", _accuracy(result, path.parent)),
         Section("forecast", "Forecast", _forecast(result, more or {})),
-        Section("figures", "Figures", _drawn(result) if figures is None else _read(figures)),
+        Section("figures", "Figures", _draw_figures(result) if figures is None else _read(figures)),
         Section("settings", "Settings", _settings(attrs)),
         Section("repeat", "How to repeat it", _repeat(result, attrs)),
         Section("files", "Files", _files(path)),
@@ -141,7 +141,7 @@ def _state(result: Any, attrs: Mapping[str, Any]) -> str:
                                     if arviz_data.of_mode(result) else
                                     "The draws are weighted ones; how many they are worth stands in the table."
                                     if "effective_draws" in attrs else
-                                    "The chains agree, and are long enough: the draws are those of the posterior of "
+                                    "The chains agree, and are long enough: the draws represent the posterior of "
                                     "this model. Whether the model fits the data, the residuals tell.")
     if arviz_data.has_group(result, report.GROUP):
         html += web_page.paragraph(f"Accuracy: {report.AccuracyReport.of(result).verdict.word}.")
@@ -156,7 +156,7 @@ def _model(attrs: Mapping[str, Any], description: str) -> str:
         "The model has no docstring; what stands in one would be shown here.", "note"))
     if assumed := json.loads(str(attrs.get(ASSUMPTIONS, "{}"))):
         html += web_page.heading("Assumptions") + web_page.facts(list(assumed.items())) + web_page.paragraph(
-            "Numbers that depend on parameters are those of one set of values typical of the prior, not of the "
+            "Numbers that depend on parameters belong to one set of values typical of the prior, not of the "
             "posterior.", "note")
     priors = json.loads(str(attrs.get(PRIORS, "{}")))
     if not priors:
@@ -292,7 +292,7 @@ def _forecast_of(dataset: xr.Dataset, result: Any) -> str:
         f"the {predictions.NOISE_FREE}.", "note")
 
 
-def _drawn(result: Any) -> str:
+def _draw_figures(result: Any) -> str:
     figures, failed = [], []
     for name, draw, names in saving.pages_of(result, "full"):
         try:
@@ -355,7 +355,7 @@ def _repeat(result: Any, attrs: Mapping[str, Any]) -> str:
     if not html:
         return web_page.paragraph("The result does not say how it was made.", "note")
     return html + web_page.paragraph("The seed makes the draws the same in the same environment: data, machine and "
-                                      "versions (see Settings). A folder that holds a result is kept; name another "
+                                      "versions (see Settings). A folder with a result is not replaced; name another "
                                       "one, or add --overwrite.", "note")
 
 

@@ -128,7 +128,7 @@ def corrected_moments(draws: Mapping[str, np.ndarray], draw_index: np.ndarray, l
         corrected mean = mean(all) + sum_i w_i x_i - mean(subset),
         corrected sd = sd(all) * sd_w(subset) / sd(subset).
 
-    The standard errors are those of the linearised changes (the delta method),
+    The standard errors are standard errors of the linearised changes (the delta method),
 
         phi_i = S w_i (x_i - m_w) - (x_i - m),    psi_i = [S w_i ((x_i - m_w)^2 / v_w - 1) - ((x_i - m)^2 / v - 1)] / 2,
 

@@ -106,23 +106,35 @@ def _axes(site: Mapping[str, Any], renamed: Mapping[str, str]) -> tuple[str | No
     return tuple(names)
 
 
-def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, paths: dict | None, draw_index: Any,
-            grid: np.ndarray | None, truth: Mapping[str, Any] | None,
-            labels: Labels | None = None) -> dict[str, xr.Dataset]:
+class TrajectoryDraws(NamedTuple):
+    """Trajectories at some draws of each chain.
+
+    Attributes:
+        draw_index: (S,), draws of each chain that have trajectories.
+        paths: `lfm_ppl.inference.posterior.trajectories`, (C, S, ...); None: no trajectories.
+        times: (K,) times of the trajectories; None: the times of the data.
+    """
+
+    draw_index: np.ndarray | None = None
+    paths: dict[str, np.ndarray] | None = None
+    times: np.ndarray | None = None
+
+
+def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, trajectories: TrajectoryDraws,
+            truth: Mapping[str, Any] | None, labels: Labels | None = None) -> dict[str, xr.Dataset]:
     """Return the groups of a result.
 
     Args:
         bound: the model and its data.
         draws: site -> (C, N, ...).
         stats: statistic of the sampler -> (C, N).
-        rated: `lfm_ppl.inference.posterior.scores` of all draws, one chain after another; None: without.
-        paths: `lfm_ppl.inference.posterior.trajectories`, (C, S, ...); None: without.
-        draw_index: (S,), draws of each chain that have trajectories.
-        grid: (K,) times of the trajectories; None: those of the data.
-        truth: of simulated data.
-        labels: names of axes; None: those of the model.
+        scores: `lfm_ppl.inference.posterior.scores` of all draws, one chain after another; None: no scores.
+        trajectories: trajectories at some of the draws.
+        truth: truth of simulated data.
+        labels: names of axes; None: the names of the model.
     """
     labels = labels or Labels.of(bound)
+    draw_index, paths, grid = trajectories
     site, times, y = bound.site, bound.times, np.asarray(bound.y)
     chains, samples = next(iter(draws.values())).shape[:2]
     model = site.example.ssm.model
@@ -152,8 +164,8 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
     }
     if per_series:
         groups["observed_data"] = groups["observed_data"].assign(times=(along, times))
-    if rated is not None:
-        split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in rated.items()}
+    if scores is not None:
+        split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in scores.items()}
         left_out = xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock, **which})
         groups["log_likelihood"] = left_out.isel(time=seen)
         groups["one_step_ahead"] = xr.Dataset(
@@ -172,7 +184,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, rated: dict | None, pat
         groups["trajectories"]["outputs"].attrs["long_name"] = NOISE_FREE
         groups["trajectories"] = with_summaries(groups["trajectories"], paths)
         if "prediction" in paths and grid is not None:
-            groups[GROUP] = predictions(bound, paths, draw_index, grid, labels.coords)
+            groups[GROUP] = predictions(bound, paths, np.asarray(draw_index), grid, labels.coords)
     if truth:
         groups["truth"] = _truth(truth, named, units, groups["posterior"])
         for kind, values in _true_functions(bound, truth, draws).items():
@@ -188,7 +200,7 @@ def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray]) ->
     """Return trajectories with the mean and the 95% interval at each time, where their density is known.
 
     That is a mixture of normal distributions, one for each draw of the parameters. The quantiles of a mixture are
-    smooth in time and much nearer to the true ones than those of the draws: 400 draws leave an error of a seventh of
+    smooth in time and much more accurate than the quantiles of the draws: 400 draws leave an error of a seventh of
     an sd. Functions that are not linear have several points for each draw, which move smoothly in time.
 
     Args:
@@ -198,7 +210,7 @@ def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray]) ->
     Returns:
         Variables ``states_summary``, ``forces_summary``, ``deterministics_summary``, ``outputs_summary``
         (noise-free) and ``new_data_summary`` (with the noise) are added, with the dimension ``statistic``: mean, q2.5,
-        q97.5. Those of which nothing but draws is known are left out.
+        q97.5. Quantities known by draws only have no summary.
     """
     datasets = {}
     for name, (mean, sd) in {"states": ("state_mean", "state_sd"), "forces": ("force_mean", "force_sd"),
@@ -214,7 +226,8 @@ def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray]) ->
         shape = tuple(like.sizes[dim] for dim in dims)
 
         def flat(label: str, shape: tuple[int, ...] = shape) -> np.ndarray:
-            values = paths[label]  # the axis of the points, if there is one, beside those of the draws
+            values = paths[label]
+            # The axis of points goes beside the axes of the draws.
             return (np.moveaxis(values, -3, 2) if label.endswith("_points") else values).reshape(-1, *shape)
 
         means = flat(mean)
@@ -226,16 +239,16 @@ def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray]) ->
 
 
 _TOLERANCE = 1e-4
-"""Of the ends of an interval, as a share of the usual spread of a draw: far below what the draws leave open."""
+"""Tolerance of the ends of an interval, in usual standard deviations of a draw, far below the Monte Carlo error."""
 
 STATISTICS = ("mean", "q2.5", "q97.5")
-"""What a summary of trajectories has at each time."""
+"""Statistics of a summary of trajectories at each time."""
 
 
 def _posterior(draws: dict, coords: dict, named: Mapping[str, list], labels: Labels) -> xr.Dataset:
     variables: dict[str, Any] = {}
     extra: dict[str, Any] = {}
-    # What is sampled comes before what is derived from it.
+    # Sampled sites come before derived ones.
     for label, value in sorted(draws.items(), key=lambda item: item[0] in labels.derived):
         shape = value.shape[2:]
         site_dims = labels.dims.get(label, (None,) * len(shape))
@@ -256,8 +269,7 @@ def _true_functions(bound: BoundModel, truth: Mapping[str, Any],
                     draws: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return outputs (K, D), noise-free, and deterministics (K, Q) along the true path, where all of it is known.
 
-    None of them where the model refuses the truth, or holds a parameter at another value: draws are worth more than a
-    line in a figure.
+    The dictionary is empty if the model raises an error for the truth, or fixes a parameter at another value.
     """
     parameters, forces = truth.get("parameters") or {}, truth.get("forces") or {}
     model = bound.site.example.ssm.model
@@ -269,14 +281,14 @@ def _true_functions(bound: BoundModel, truth: Mapping[str, Any],
     size = len(model.state_names)
     if [part.shape for part in parts] != [(len(times), size), *[(len(times),)] * len(model.force_names)]:
         return {}
-    if any(_held_elsewhere(draws[name], parameters[name]) for name in set(parameters) & set(draws)):
+    if any(_is_fixed_elsewhere(draws[name], parameters[name]) for name in set(parameters) & set(draws)):
         return {}
     try:
         values = {name: np.broadcast_to(np.asarray(parameters[name], float), draws[name].shape[2:])
                   for name in bound.sites}
         ssm = bound.likelihood(values).ssm
         w = jnp.asarray(np.column_stack(parts))
-        series = {OUTPUT: np.asarray(jax.vmap(lambda one, t: expected_observation(ssm, one, t))(w, times))}
+        series = {OUTPUT: np.asarray(jax.vmap(lambda inputs, t: expected_observation(ssm, inputs, t))(w, times))}
     except Exception:
         return {}
     try:
@@ -286,8 +298,8 @@ def _true_functions(bound: BoundModel, truth: Mapping[str, Any],
     return series | (more if model.deterministic_names else {})
 
 
-def _held_elsewhere(draws: np.ndarray, truth: Any) -> bool:
-    """Whether an element of draws (C, S, ...) is the same in all of them, and not the true one."""
+def _is_fixed_elsewhere(draws: np.ndarray, truth: Any) -> bool:
+    """Return whether an element is the same in all draws (C, S, ...) and differs from the truth."""
     try:
         fixed = np.ptp(draws, axis=(0, 1)) == 0
         return bool(np.any(fixed & ~np.isclose(draws[0, 0], np.broadcast_to(truth, fixed.shape))))
@@ -301,31 +313,31 @@ def _true_states(truth: Mapping[str, Any]) -> np.ndarray:
 
 
 def checked_truth(bound: BoundModel, truth: Mapping[str, Any] | None, labels: Labels) -> dict[str, Any]:
-    """Return what a result can hold of a truth, in the form of `lfm_ppl.Data.truth`, and warn of the rest.
+    """Return the entries of a truth that a result can store, as in `lfm_ppl.Data.truth`, and warn of the others.
 
     Raises:
-        ValueError: its parts do not fit together.
+        ValueError: inconsistent entries.
     """
     if not truth:
         return {}
     entries = dict(truth)
     for name in [name for name in entries if name not in TRUTH]:
-        checks.warn(f"{checks.unknown('entry of the truth', name, TRUTH)} It is left out.")
+        checks.warn(f"{checks.unknown('entry of the truth', name, TRUTH)} It is ignored.")
         del entries[name]
     if np.ndim(bound.y) != 2 and set(entries) - {"parameters"}:
-        checks.warn("of the truth of several series only parameters are drawn; states and forces are left out.")
+        checks.warn("the truth of several series is limited to parameters; states and forces are ignored.")
         entries = {name: value for name, value in entries.items() if name == "parameters"}
     try:
         check_truth(entries)
     except ValueError as error:
-        raise ValueError(f"the truth does not fit together: {error}") from None
+        raise ValueError(f"the truth is inconsistent: {error}") from None
     for message in unplaced(bound, entries, labels):
         checks.warn(message)
     return entries
 
 
 def unplaced(bound: BoundModel, truth: Mapping[str, Any], labels: Labels) -> list[str]:
-    """Return what a truth says of something that the model does not have, a message each."""
+    """Return a message for each entry of a truth that the model does not have."""
     model = bound.site.example.ssm.model
     expected_names = {"force": model.force_names, "deterministic": model.deterministic_names,
              "parameter": (*bound.sites, *sorted(labels.derived))}

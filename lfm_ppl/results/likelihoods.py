@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -29,28 +30,28 @@ _PILOT = 8
 """Draws that the pilot run takes."""
 
 GRID_ERROR = 1e-2
-"""Discretisation error of a log likelihood that does not matter: most of it is common to all draws, and cancels."""
+"""Tolerated discretisation error of a log likelihood: most of it is common to all draws, and cancels."""
 
 _SCOUTS = 10
-"""Draws whose models the grid is laid out for: those with the smallest and largest parameters, and others between."""
+"""Number of draws whose models determine the grid: extremes of each parameter, and draws between."""
 
 
-class PosteriorDraws(NamedTuple):
+class LikelihoodProblem(NamedTuple):
     """A bound model, and draws of its parameters.
 
     Attributes:
         bound: the model with its times and data.
         draws: site name -> (S, ...).
-        parts: maps the name of what is computed to what keeps its batches; None: they are not kept.
+        stores: function from the name of a computation to the store of its batches; None: no stores.
     """
 
     bound: BoundModel
     draws: Mapping[str, np.ndarray]
-    parts: Callable[[str], BatchStore] | None = None
+    stores: Callable[[str], BatchStore] | None = None
 
-    def kept(self, name: str) -> BatchStore | None:
-        """Return what keeps the batches of a computation."""
-        return None if self.parts is None else self.parts(name)
+    def batch_store(self, name: str) -> BatchStore | None:
+        """Return the store of the batches of a computation."""
+        return None if self.stores is None else self.stores(name)
 
     @property
     def example(self) -> SeriesLikelihood:
@@ -72,7 +73,7 @@ class PosteriorDraws(NamedTuple):
         """Number of series."""
         return self.y.shape[0] if isinstance(self.bound.site.distribution, Panel) else 1
 
-    def at(self, rows: Any) -> PosteriorDraws:
+    def select(self, rows: Any) -> LikelihoodProblem:
         """Return the same problem with some of the draws."""
         return self._replace(draws={name: value[rows] for name, value in self.draws.items()})
 
@@ -93,13 +94,34 @@ class Reference(NamedTuple):
     limited: bool = False
 
 
+@dataclass(frozen=True)
+class ReferenceSettings:
+    """Settings of a reference likelihood.
+
+    Attributes:
+        kind: "grid", "particles" or "none".
+        particles: number of particles; None: chosen by a pilot run.
+        replicates: number of replicates of the particle filter.
+        steps: integration steps between two times; None: the steps of the Gaussian filter.
+        seed: seed of the particle filter.
+        show_progress: whether the progress is shown.
+    """
+
+    kind: str
+    particles: int | None
+    replicates: int
+    steps: int | None = None
+    seed: int = 0
+    show_progress: bool = False
+
+
 def is_exact(ssm: StateSpaceModel) -> bool:
     """Whether the Gaussian filter computes the exact likelihood: linear dynamics and observation, Gaussian noise."""
     is_family = isinstance(ssm.model.observation, ObservationFamily)
     return ssm.time_invariant and not is_family and not is_observation_nonlinear(ssm)
 
 
-def gaussian(problem: PosteriorDraws, name: str = "log likelihoods") -> np.ndarray:
+def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods") -> np.ndarray:
     """Return (S,): the log likelihoods of the Gaussian filter, summed over the series of a panel."""
     bound = problem.bound
 
@@ -107,13 +129,13 @@ def gaussian(problem: PosteriorDraws, name: str = "log likelihoods") -> np.ndarr
         return {"total": bound.likelihood(values, y).log_prob(bound.data(y)).sum()}
 
     return map_draws(bound, "log likelihoods", per_draw, problem.draws, jax.random.key(0), rows=bound.times.size,
-                     store=problem.kept(name))["total"]
+                     store=problem.batch_store(name))["total"]
 
 
-def recorded(problem: PosteriorDraws, log_likelihoods: np.ndarray) -> np.ndarray:
-    """Return (S,): what a result records of its log likelihoods, the sum of one-step-ahead terms.
+def recorded(problem: LikelihoodProblem, log_likelihoods: np.ndarray) -> np.ndarray:
+    """Return (S,): the log likelihoods that a result stores, sums of one-step-ahead terms.
 
-    Those of the Gaussian filter are the sum itself; of an observation family they are of assumed density filtering.
+    For Gaussian observations the sum is the log likelihood; for an observation family assumed density filtering.
     """
     bound = problem.bound
     if not isinstance(problem.example.ssm.model.observation, ObservationFamily):
@@ -123,7 +145,7 @@ def recorded(problem: PosteriorDraws, log_likelihoods: np.ndarray) -> np.ndarray
         return bound.likelihood(values, y).log_prob_per_observation(bound.data(y)).sum()
 
     return map_draws(bound, "one step ahead", per_draw, problem.draws, jax.random.key(0), rows=bound.times.size,
-                     store=problem.kept("one-step-ahead terms"))
+                     store=problem.batch_store("one-step-ahead terms"))
 
 
 def finer_tolerance(tolerance: float) -> float:
@@ -141,31 +163,31 @@ def finer_steps(example: SeriesLikelihood) -> dict[str, Any]:
     return settings
 
 
-def gaussian_with_finer_steps(problem: PosteriorDraws) -> np.ndarray:
+def gaussian_with_finer_steps(problem: LikelihoodProblem) -> np.ndarray:
     """Return (S,): the log likelihoods of the Gaussian filter with about twice as many integration steps."""
     finer = problem.bound.approximate(**finer_steps(problem.example))
     return gaussian(problem._replace(bound=finer), "log likelihoods with finer steps")
 
 
-def on_grid(problem: PosteriorDraws, steps: int | None, progress: bool) -> Reference:
+def on_grid(problem: LikelihoodProblem, settings: ReferenceSettings) -> Reference:
     """Return the log likelihoods by the Fokker-Planck equation on one grid for all draws.
 
     Raises:
         ValueError: what the grid raises, for states of more than one dimension, no noise, and so on.
     """
-    layout = fokker_planck.choose_grid(_scouted(problem), problem.example.times, problem.y, tolerance=GRID_ERROR)
-    bound = problem.bound
+    layout = fokker_planck.choose_grid(_scout_models(problem), problem.example.times, problem.y, tolerance=GRID_ERROR)
+    bound, steps = problem.bound, settings.steps
 
-    def one(distribution: SeriesLikelihood, y: jax.Array) -> jax.Array:
+    def series_log_likelihood(distribution: SeriesLikelihood, y: jax.Array) -> jax.Array:
         time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps,
                                     distribution.max_step)
         return fokker_planck.log_likelihood(distribution.ssm, time_grid, y, layout)
 
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
-        return map_series(bound.likelihood(values, y), one, bound.data(y)).sum()
+        return map_series(bound.likelihood(values, y), series_log_likelihood, bound.data(y)).sum()
 
-    log_likelihoods = _one_by_one(problem, jax.random.key(0), ("grid", layout, steps), per_draw, "Fokker-Planck grid",
-                                  progress)
+    log_likelihoods = _map_sequentially(problem, jax.random.key(0), ("Fokker-Planck grid", layout, steps), per_draw,
+                                        settings.show_progress)
     return Reference(log_likelihoods[:, None], f"Fokker-Planck equation on a grid of {layout.cells} cells")
 
 
@@ -174,43 +196,39 @@ def takes_smoother_draws(ssm: StateSpaceModel) -> bool:
     return isinstance(ssm.model.observation, ObservationFamily) and is_linear(ssm)
 
 
-def by_particles(problem: PosteriorDraws, particles: int | None, replicates: int, steps: int | None, key: jax.Array,
-                 progress: bool, noise: Callable[[np.ndarray], float], target: float, most_work: float) -> Reference:
+def by_particles(problem: LikelihoodProblem, settings: ReferenceSettings, noise: Callable[[np.ndarray], float],
+                 target: float, most_work: float) -> Reference:
     """Return replicates of the particle filter's estimates, or of importance sampling where `takes_smoother_draws`.
 
-    Without a number of particles, a pilot run at a few draws, spread over all, finds the number at which the noise of
-    a draw's averaged estimate is below ``target``, for the variance falls in proportion to it.
+    Without a number of particles, a pilot run at a few draws determines the number at which the noise of the averaged
+    estimate of a draw is below ``target``: the variance is inversely proportional to it.
 
     Args:
         problem: the draws.
-        particles: N, or None.
-        replicates: R.
-        steps: integration steps between two times; None: those of the Gaussian filter.
-        key: a JAX random key.
-        progress: whether to show how far it is.
+        settings: settings of the particle filter.
         noise: maps estimates (S, R) to the sd of their averages.
-        target: of that sd.
-        most_work: limit on the number of particle steps, from which that on N follows.
+        target: largest sd.
+        most_work: limit on the number of particle steps, which limits the number of particles.
     """
     example = problem.example
-    pilot_key, key = jax.random.split(key)
+    pilot_key, key = jax.random.split(jax.random.key(settings.seed))
     limited = False
-    count = particles or _FIRST_PARTICLES
-    run = _particle_run(problem, count, replicates, steps, progress)
-    if particles is None:
+    count, replicates = settings.particles or _FIRST_PARTICLES, settings.replicates
+    run = _particle_run(problem, count, settings)
+    if settings.particles is None:
         rows = np.unique(np.linspace(0, problem.size - 1, _PILOT).round().astype(int))
-        keep = problem.parts
-        pilot = None if keep is None else lambda name: keep(f"pilot {name}")
-        sd = noise(run(problem.at(rows)._replace(parts=pilot), pilot_key))
-        needed = count * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
-        time_grid = build_time_grid(example.ssm, example.times, steps or example.steps, example.max_step)
+        stores = problem.stores
+        pilot_stores = None if stores is None else lambda name: stores(f"pilot {name}")
+        sd = noise(run(problem.select(rows)._replace(stores=pilot_stores), pilot_key))
+        needed_particles = count * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
+        time_grid = build_time_grid(example.ssm, example.times, settings.steps or example.steps, example.max_step)
         steps_made = np.shape(time_grid.intervals.length)[0] * time_grid.steps
         each_particle = problem.size * replicates * problem.series * steps_made
         most = max(count, most_work / each_particle)
-        limited = needed > most
-        if needed > count and most > count:
-            count = int(np.ceil(min(needed, most) / 500) * 500)
-            run = _particle_run(problem, count, replicates, steps, progress)
+        limited = needed_particles > most
+        if needed_particles > count and most > count:
+            count = int(np.ceil(min(needed_particles, most) / 500) * 500)
+            run = _particle_run(problem, count, settings)
     method = (f"importance sampling, {replicates} runs of {count:,} draws of the smoother" if takes_smoother_draws(
         example.ssm) else f"particle filter, {replicates} runs of {count:,} particles")
     return Reference(run(problem, key), f"{method} a draw", count, limited)
@@ -218,22 +236,21 @@ def by_particles(problem: PosteriorDraws, particles: int | None, replicates: int
 
 _FIRST_PARTICLES = 1000
 _SAFETY = 1.2
-"""Margin of the number of particles over what the pilot run asks for, which is itself an estimate."""
+"""Factor on the number of particles of the pilot run, which is an estimate."""
 
 
-def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, steps: int | None,
-                  progress: bool) -> Callable:
-    example = problem.example
+def _particle_run(problem: LikelihoodProblem, particles: int, settings: ReferenceSettings) -> Callable:
+    example, steps = problem.example, settings.steps
     check_noise(example.ssm, example.time_grid.initial_time)
-    settings = particle_filter.check_settings(example.ssm, ParticleSettings(particles))
+    filter_settings = particle_filter.check_settings(example.ssm, ParticleSettings(particles))
 
-    def one(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
+    def series_log_likelihood(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
         time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps,
                                     distribution.max_step)
         if takes_smoother_draws(distribution.ssm):
             filtering = filter_problem(distribution.ssm, distribution.rule, time_grid)
             return importance.log_likelihood(filtering, y, key, particles, as_settings(distribution.sites))
-        return particle_filter.log_likelihood(distribution.ssm, time_grid, y, key, settings)
+        return particle_filter.log_likelihood(distribution.ssm, time_grid, y, key, filter_settings)
 
     bound, series = problem.bound, problem.series
 
@@ -243,23 +260,25 @@ def _particle_run(problem: PosteriorDraws, particles: int, replicates: int, step
 
         def replicate(key: jax.Array) -> jax.Array:
             keys = jax.random.split(key, series) if isinstance(distribution, Panel) else key
-            return map_series(distribution, one, y, keys).sum()
+            return map_series(distribution, series_log_likelihood, y, keys).sum()
 
-        return jax.lax.map(replicate, jax.random.split(key, replicates))
+        return jax.lax.map(replicate, jax.random.split(key, settings.replicates))
 
-    name = ("particles", settings, replicates, steps)
-    label = f"particle filter, {particles:,} particles"
-    return lambda problem, key: _one_by_one(problem, key, name, per_draw, label, progress)
+    def run(problem: LikelihoodProblem, key: jax.Array) -> np.ndarray:
+        name = (f"particle filter, {particles:,} particles", filter_settings, settings.replicates, steps)
+        return _map_sequentially(problem, key, name, per_draw, settings.show_progress)
 
-
-def _one_by_one(problem: PosteriorDraws, key: jax.Array, name: Hashable, per_draw: Callable, label: str,
-                progress: bool) -> np.ndarray:
-    """Map over draws, one after another, and say how far that is."""
-    return map_draws(problem.bound, name, per_draw, problem.draws, key, label=label,
-                     report=Console() if progress else None, store=problem.kept(label))
+    return run
 
 
-def _scouted(problem: PosteriorDraws) -> list[Any]:
+def _map_sequentially(problem: LikelihoodProblem, key: jax.Array, name: tuple[str, *tuple[Hashable, ...]],
+                      per_draw: Callable, show_progress: bool) -> np.ndarray:
+    """Map over draws, one after another, with a display of the progress."""
+    return map_draws(problem.bound, name, per_draw, problem.draws, key, report=Console() if show_progress else None,
+                     store=problem.batch_store(name[0]))
+
+
+def _scout_models(problem: LikelihoodProblem) -> list[Any]:
     """Return latent force models at draws that span the posterior, to lay out one grid for all."""
     flat = np.column_stack([np.reshape(value, (problem.size, -1)) for value in problem.draws.values()])
     extreme = np.concatenate([flat.argmin(axis=0), flat.argmax(axis=0)])

@@ -13,7 +13,7 @@ from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.likelihood_site import LikelihoodSite
 from lfm_ppl.results import arviz_data, inputs
-from lfm_ppl.results.likelihoods import PosteriorDraws
+from lfm_ppl.results.likelihoods import LikelihoodProblem
 
 _TOLERANCE = 1e-6
 """Relative difference of log likelihoods between machines and versions that is rounding."""
@@ -46,7 +46,7 @@ def keywords(result: Any, later: Mapping[str, Any] | None, overrides: Mapping[st
 
 
 def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None,
-            model_kwargs: Mapping[str, Any] | None = None) -> PosteriorDraws:
+            model_kwargs: Mapping[str, Any] | None = None) -> LikelihoodProblem:
     """Return model, data and all draws (C * N, ...) of the sample sites, with the result's fixed parameters.
 
     Raises:
@@ -61,14 +61,14 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
     bound = bind(numpyro_model, times, y, **inputs.keywords(result, model_kwargs))
     _check_settings(bound.site, attrs)
     bound = bound.fix(json.loads(attrs.get("fixed") or "{}"))
-    return PosteriorDraws(bound, _latent(bound, posterior))
+    return LikelihoodProblem(bound, _latent(bound, posterior))
 
 
 def check_likelihood(result: Any, log_likelihood: np.ndarray, draw_index: np.ndarray) -> None:
     """Compare log likelihoods (C, S) at draws ``chosen`` (S,) of each chain with those that the result records.
 
     Raises:
-        ValueError: they differ: the model, its options or the data are others than those of the result.
+        ValueError: they differ: model, options or data are not the ones of the result.
     """
     if not arviz_data.has_group(result, "one_step_ahead"):
         return
@@ -77,8 +77,8 @@ def check_likelihood(result: Any, log_likelihood: np.ndarray, draw_index: np.nda
     difference = np.abs(recorded - log_likelihood)
     if np.any(difference > _TOLERANCE * (1.0 + np.abs(recorded))):
         raise ValueError(f"the model gives other log likelihoods than the result records, by up to {difference.max():g}"
-                         " at its draws: the model, its options or the data are not those that the result was made "
-                         "with. Fit again, or give what was used then.")
+                         " at its draws: model, options or data differ from the ones of the result. "
+                         "Fit again, or use the original ones.")
 
 
 def _check_settings(site: LikelihoodSite, attrs: Mapping[str, Any]) -> None:

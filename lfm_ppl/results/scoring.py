@@ -22,7 +22,7 @@ ALL = "all"
 """The row of a table of scores for all outputs together."""
 
 _FEW = 10.0
-"""Draws that carry a log score; with fewer it is told more by chance than by the forecast."""
+"""Least number of draws for a log score; with fewer it depends more on chance than on the forecast."""
 
 _SAME_TIME = 1e-9
 """Relative difference of times that is rounding."""
@@ -67,7 +67,7 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
         result: what `lfm_ppl.forecast`, or `lfm_ppl.fit` with ``at``, returned; or its dataset ``predictions``.
         held_out: (K, D) (or (K,) for one output; (B, K, D) for a panel), one row for each time of the predictions; or a
             `lfm_ppl.Data` or a DataArray with coordinates time and output, whose times must be among those predicted;
-            dates are counted as those of the result. NaN entries are left out.
+            dates are counted as in the result. NaN entries are ignored.
         level: of the interval, between 0 and 1.
         numpyro_model: of an observation family, the model that was fitted; without it there is no log score.
         inputs: as in `lfm_ppl.forecast`, and so is the next.
@@ -135,9 +135,12 @@ def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd:
     """
     mean, sd = (None, None) if mean is None or sd is None else (mean, sd)
     if np.any(angular):
-        # Everything on the branch that has the mean direction in its middle.
+        # All angles on the branch centred on the mean direction.
         centre = np.angle(np.exp(1j * draws).mean(axis=0))
-        unwrap = lambda value: np.where(angular, centre + np.angle(np.exp(1j * (value - centre))), value)  # noqa: E731
+
+        def unwrap(value: np.ndarray) -> np.ndarray:
+            return np.where(angular, centre + np.angle(np.exp(1j * (value - centre))), value)
+
         draws, y, mean = unwrap(draws), unwrap(y), None if mean is None else unwrap(mean)
     present = np.isfinite(y)
     below = 0.5 * (1.0 - level)
@@ -175,7 +178,7 @@ def _family_densities(result: Any, numpyro_model: Callable, predicted: xr.Datase
     labels = posterior["draw"].values if "draw" in posterior.coords else np.arange(posterior.sizes["draw"])
     draw_index = np.searchsorted(labels, predicted["draw"].values)
     rows = (np.arange(posterior.sizes["chain"])[:, None] * len(labels) + draw_index).ravel()
-    return log_densities(problem.bound, problem.at(rows).draws, predicted, y)
+    return log_densities(problem.bound, problem.select(rows).draws, predicted, y)
 
 
 def crps(draws: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -216,7 +219,10 @@ def table(scores: Scores, outputs: list[str], level: float = 0.95) -> pd.DataFra
 def summary(scores: Scores, level: float = 0.95) -> dict[str, float]:
     """Return the mean scores of the entries that were measured."""
     present = np.isfinite(scores.error)
-    mean = lambda values: float(np.mean(values[present])) if present.any() else np.nan  # noqa: E731
+
+    def mean(values: np.ndarray) -> float:
+        return float(np.mean(values[present])) if present.any() else np.nan
+
     return {"n": int(present.sum()), "rmse": float(np.sqrt(mean(scores.error**2))), "crps": mean(scores.crps),
             "log_score": mean(scores.log_score), f"coverage_{100 * level:g}": mean(scores.covered)}
 
@@ -251,7 +257,7 @@ def aligned(predicted: xr.Dataset, variable: xr.DataArray, held_out: Any,
 
 
 def _on_clock(held_out: Any, origin: str | None, unit: str) -> Any:
-    """Return held-out data whose times, if they are dates, are counted as those of a result.
+    """Return held-out data whose dates are counted as in the result.
 
     Args:
         held_out: as in `score`.

@@ -101,7 +101,7 @@ def judge(findings: Findings) -> Verdict:
     - "trust" otherwise: every mean within 0.1 sd and every sd within 10% of the corrected one, or within two Monte
       Carlo standard errors.
     """
-    word, reason, command = _judged(findings)
+    word, reason, command = _verdict_from(findings)
     notes = _notes(findings)
     remedies = {command: _cost(command)} if command else {}
     refit = _refit_with_iterations(findings)
@@ -137,7 +137,7 @@ def _refit_with_iterations(findings: Findings) -> dict[str, str]:
     return {command: "a second fit, some four times as long"}
 
 
-def _judged(findings: Findings) -> tuple[str, str, str]:
+def _verdict_from(findings: Findings) -> tuple[str, str, str]:
     if not findings.step_change_sd <= STEP_CHANGE:
         if findings.tolerance is None:
             finer, advice = f"--steps {2 * findings.steps}", f"with {2 * findings.steps} steps"

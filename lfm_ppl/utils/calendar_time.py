@@ -1,8 +1,8 @@
 """Calendar time: dates and times of day as numbers of a unit since an origin, and back.
 
 The origin is the midnight before the first time, on the clock of the data, so that a force with a daily or weekly
-period knows the time of day. Differences are those of absolute time: with an offset from UTC in every row, the hour
-that a change to summer time leaves out or repeats is counted right.
+period knows the time of day. Differences refer to absolute time: with an offset from UTC in every row, changes to
+and from summer time are counted correctly.
 """
 
 from __future__ import annotations

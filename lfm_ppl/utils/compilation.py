@@ -20,7 +20,7 @@ ONE_THREAD = {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS":
 """Environment in which a process computes with one thread: JAX reads it at its first computation, NumPy when imported.
 
 Processes side by side would otherwise have as many threads each as there are CPUs, which hand small operations to one
-another: two Hamiltonian chains on two CPUs took over four times as long as one by itself."""
+another: two Hamiltonian chains on two CPUs took over four times as long as a single one."""
 
 
 def cpus() -> int:
@@ -46,7 +46,7 @@ def fast_loops() -> None:
     setting filters and their gradients take a half to a quarter of the time there. From JAX 0.12 on it is how loops are
     compiled anyway. The option is added to the environment variable ``XLA_FLAGS``, which XLA reads at the first
     computation: call this before it, as ``numpyro.set_host_device_count``. An option that is set already stays.
-    The command line does this by itself.
+    The command line does this.
 
     Example:
         >>> import lfm_ppl as lfm
@@ -66,7 +66,7 @@ def fast_loops() -> None:
 
 
 def quick_compilation(level: int) -> None:
-    """Let XLA spend less on compiling programs that run for a moment, as those of tests do.
+    """Reduce the compilation effort of XLA, for short programs such as tests.
 
     Its older emitters compile the small loops of a filter faster, and a program is compiled in one piece: by default
     XLA cuts it into 32, for threads that there may not be, and compiles what they share in each. Newer versions may

@@ -139,7 +139,7 @@ def fit(
         checkpoint: folder that stores the run: the state of the chains and their draws, written every few seconds, and
             ``posterior.nc`` with the draws so far and at the end with the complete result. A killed process loses the
             last block of draws.
-        resume: continue the run in ``checkpoint``; its draws are those of an uninterrupted run. Model, data, settings
+        resume: continue the run in ``checkpoint``; with the draws of an uninterrupted run. Model, data, settings
             and versions must be the same. A finished run is read and returned; in an empty or missing folder a new run
             starts.
         overwrite: replace a result or an unfinished run in ``checkpoint``.
@@ -172,7 +172,7 @@ def fit(
 
     Raises:
         ValueError, TypeError: unknown sampler, wrong shapes, unknown parameters in ``fixed``, and so on; other model,
-            data or settings than those of the resumed run; no starting point of finite density (the message names the
+            data or settings than in the resumed run; no starting point of finite density (the message names the
             part of the log density that is not finite at the prior median).
         FileExistsError, FileNotFoundError: the folder holds a result or a run; there is no run to resume.
         KeyboardInterrupt: Ctrl-C before the first draw, without a checkpoint, or for the second time.

@@ -34,7 +34,7 @@ from lfm_ppl.results.approximation import approximation_warnings, resolution_war
 from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
-from lfm_ppl.results.layout import Labels, lay_out
+from lfm_ppl.results.layout import Labels, TrajectoryDraws, lay_out
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
@@ -105,14 +105,14 @@ class PostProcessing:
 
     Attributes:
         scores: of the observations; None where they are not computed.
-        trajectories: chosen draws, their trajectories, and the times of these; see `draw_paths`.
+        trajectories: see `draw_paths`.
         attributes: of the result.
         warnings: on the likelihood.
         partial: the groups that a result has after Ctrl-C; None: all.
     """
 
     scores: Any = None
-    trajectories: tuple = (None, None, None)
+    trajectories: TrajectoryDraws = TrajectoryDraws()
     attributes: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     partial: str | None = None
@@ -173,7 +173,7 @@ def _site_attributes(bound: BoundModel, draws: PosteriorDraws, values: Mapping[s
 
 def draw_paths(key: jax.Array, bound: BoundModel, values: Mapping[str, np.ndarray], requested_times: Any, count: int,
                particle_settings: Any = None, particle_steps: int | None = None,
-               **batch_options: Any) -> tuple[np.ndarray, dict | None, np.ndarray | None]:
+               **batch_options: Any) -> TrajectoryDraws:
     """Draw trajectories for draws that are spread evenly over each chain.
 
     Args:
@@ -187,20 +187,20 @@ def draw_paths(key: jax.Array, bound: BoundModel, values: Mapping[str, np.ndarra
         **batch_options: ``report`` and ``store`` of `lfm_ppl.inference.posterior.trajectories`.
 
     Returns:
-        The chosen draws of each chain; their trajectories (C, S, ...), None if there are none; the times, None for the
-        times of the data.
+        The trajectories (C, S, ...), with the draws of each chain and the times.
     """
     chains, samples = values[bound.sites[0]].shape[:2]
     draw_indices, rows = evenly_spaced(chains, samples, count)
     if not len(rows):
-        return draw_indices, None, None
+        return TrajectoryDraws(draw_indices)
     times = _trajectory_times(bound, requested_times)
     subset = {site: values[site].reshape(-1, *values[site].shape[2:])[rows] for site in bound.sites}
     paths = trajectories(key, bound, subset, times, particle_settings, particle_steps, **batch_options)
     if requested_times is None:
         paths.pop("prediction", None)  # stored at requested times only
+    paths.pop("log_likelihood", None)
     by_chain = {name: path.reshape(chains, len(draw_indices), *path.shape[1:]) for name, path in paths.items()}
-    return draw_indices, by_chain, times
+    return TrajectoryDraws(draw_indices, by_chain, times)
 
 
 def _trajectory_times(bound: BoundModel, requested_times: Any) -> np.ndarray | None:
@@ -222,8 +222,7 @@ def build_result(problem: FitProblem, draws: PosteriorDraws, processed: PostProc
         "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **draws.attributes, **processed.attributes,
         "partial": partial, "run": None if store is None else store.record, **problem.user_attributes,
     }  # fmt: skip
-    draw_indices, paths, times = processed.trajectories
-    groups = lay_out(problem.bound, draws.values, draws.statistics, processed.scores, paths, draw_indices, times,
+    groups = lay_out(problem.bound, draws.values, draws.statistics, processed.scores, processed.trajectories,
                      problem.truth, problem.labels)
     attributes |= remember(groups, problem.data, *problem.clock)
     return arviz_data.build(groups, {name: value for name, value in attributes.items() if value is not None})

@@ -12,7 +12,6 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.posterior import evenly_spaced, noise_of_rows, trajectories
 from lfm_ppl.io.data_set import InputTable
 from lfm_ppl.model.inputs import Input
-from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results import inputs as known_inputs
@@ -44,9 +43,9 @@ def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mappin
     Args:
         result: of `lfm_ppl.fit`, or read by `lfm_ppl.load`.
         numpyro_model: the model that was fitted. A result holds draws and data, but no code.
-        times: (K,) times of the forecast, non-decreasing, from the initial time on; dates where those of the data were.
+        times: (K,) times of the forecast, non-decreasing, from the initial time on; dates if the data have dates.
         inputs: known inputs (`lfm_ppl.Input`) that reach as far as ``times``, and are the same as before at the data:
-            those that the result holds, by name, or keyword arguments of the model that replace those of the fit.
+            inputs by name, or keyword arguments of the model, that replace the ones of the result.
         model_kwargs: keyword arguments of the model, as in the fit.
         draws: number of posterior draws, spread over the chains, each with a path of its own.
         seed: of the paths and the noise.
@@ -105,15 +104,15 @@ def _forecast(result: Any, numpyro_model: Callable, times: np.ndarray, inputs: M
     settings = None
     if str(attrs.get("sampler", "")).startswith("pmmh") and "particles" in attrs:
         settings = ParticleSettings(int(attrs["particles"]))
-    # That of an observation family, by its sites, depends on the times of the forecast in its last digits.
-    has_log_likelihood = not isinstance(bound.site.example.ssm.model.observation, ObservationFamily)
-    paths = trajectories(jax.random.key(seed), bound, problem.at(rows).draws, times, settings,
-                         log_likelihood=has_log_likelihood, report=Console() if progress else None)
+    paths = trajectories(jax.random.key(seed), bound, problem.select(rows).draws, times, settings,
+                         report=Console() if progress else None)
     split = {name: value.reshape(chains, len(draw_index), *value.shape[1:]) for name, value in paths.items()}
-    if "log_likelihood" in split:
-        total = split["log_likelihood"].reshape(chains, len(draw_index), -1).sum(axis=-1)
+    log_likelihood = split.pop("log_likelihood", None)
+    # The log likelihood of an observation family depends on the times of the forecast in its last digits.
+    if log_likelihood is not None and not bound.site.example.is_family:
+        total = log_likelihood.reshape(chains, len(draw_index), -1).sum(axis=-1)
         rebuilding.check_likelihood(result, total, draw_index)
-    # Data that an earlier forecast was compared with are not those of this one.
+    # Held-out data of an earlier forecast do not belong to this one.
     groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result) if name not in (
         HELD_OUT, known_inputs.FORECAST)}
     labels = posterior["draw"].values[draw_index] if "draw" in posterior.coords else draw_index

@@ -14,7 +14,7 @@ from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.posterior import scores
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.layout import Labels, checked_truth, lay_out
+from lfm_ppl.results.layout import Labels, TrajectoryDraws, checked_truth, lay_out
 from lfm_ppl.utils import checks
 from lfm_ppl.workflows.data_binding import check_requested_times
 from lfm_ppl.workflows.fit_options import model_docstring, versions
@@ -56,7 +56,7 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: Any, y: Any, *, at: Any 
 
     Raises:
         TypeError: ``mcmc`` is neither.
-        ValueError: it has not run, or its draws are not those of the model's parameters.
+        ValueError: it has not run, or its draws do not belong to the model's parameters.
 
     Warns:
         ConvergenceWarning: as `lfm_ppl.fit`.
@@ -93,10 +93,10 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: Any, y: Any, *, at: Any 
     truth = checked_truth(bound, truth, labels)
     chains, samples = next(iter(draws.values())).shape[:2]
     flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
-    rated = best_effort("scores of the observations", lambda: scores(bound, flat), None)
-    draw_index, paths, grid = best_effort("trajectories", lambda: draw_paths(
-        jax.random.key(seed), bound, draws, at, trajectory_draws), (None, None, None))
-    groups = lay_out(bound, draws, stats, rated, paths, draw_index, grid, truth, labels)
+    score_values = best_effort("scores of the observations", lambda: scores(bound, flat), None)
+    paths = best_effort("trajectories", lambda: draw_paths(
+        jax.random.key(seed), bound, draws, at, trajectory_draws), TrajectoryDraws())
+    groups = lay_out(bound, draws, stats, score_values, paths, truth, labels)
     example = bound.site.example
     kernel = getattr(mcmc, "sampler", None)
     attrs = {

@@ -10,7 +10,7 @@ from scipy.special import lpmv
 
 from lfm_ppl import orbits
 from lfm_ppl.orbits import bodies, earth, geopotential, times
-from lfm_ppl.orbits.table import Table
+from lfm_ppl.orbits.table import TimeTable
 
 erfa = pytest.importorskip("erfa", reason="needs the extra gps")
 
@@ -173,9 +173,9 @@ def test_sun_and_moon_follow_their_tables():
 
 def test_a_table_is_exact_for_cubics_and_refuses_nonsense():
     nodes = np.arange(6.0)
-    table = Table(0.0, 1.0, np.stack([nodes**3, nodes], axis=1))
+    table = TimeTable(0.0, 1.0, np.stack([nodes**3, nodes], axis=1))
     for t in (0.0, 0.4, 2.5, 4.9, 5.0):
         np.testing.assert_allclose(table(t), [t**3, t], atol=1e-12)
     for values in (np.zeros((3, 1)), np.full((5, 1), np.nan)):
         with pytest.raises(ValueError, match="table"):
-            Table(0.0, 1.0, values)
+            TimeTable(0.0, 1.0, values)

@@ -11,7 +11,7 @@ from lfm_ppl import orbits
 from lfm_ppl.experiments.gps import problem
 from lfm_ppl.orbits import learning, magnitudes, prediction, training
 from lfm_ppl.orbits.arc import NOISE, Arc
-from lfm_ppl.orbits.table import Table
+from lfm_ppl.orbits.table import TimeTable
 
 
 def test_common_magnitudes_are_the_mean_and_the_scatter_of_the_satellites():
@@ -128,7 +128,7 @@ def freely(request):
     along[:, 6:9] = orbits.NANO * np.linalg.qr(random.normal(size=(3, 3)))[0]
     if axes == "RTN":
         along[:, 9] = orbits.NANO * random.normal(size=3)
-    table = Table(BEGIN, 1.0, (1 + GROWTH * np.arange(8.0)[:, None]) * along.ravel())
+    table = TimeTable(BEGIN, 1.0, (1 + GROWTH * np.arange(8.0)[:, None]) * along.ravel())
     on_orbit = 90.0 * np.eye(along.shape[1] - 6)[0]
     near = orbits.Neighbourhood(np.zeros((COUNT, 6)), table, on_orbit, axes, orbits.GPS_PERIOD)
     # Forces and noises that move a satellite by far more than its positions' noise within hours.
@@ -230,7 +230,7 @@ def test_the_regression_has_the_densities_of_the_filter(learning_from):
     data, vector = learning_from
     assert np.isnan(data.y).any() and len(data.times) == 36
     settings = {"rule": lfm.Taylor(), "steps": training.steps_of(data.times)}
-    system = training.departing(vector, data.near, data.axes)
+    system = training.departing(vector, data.neighbourhood, data.axes)
     found = lfm.filter(system, data.times, data.y, **settings)
     assert float(training.log_likelihood(vector, data.regression, data.axes)) == pytest.approx(
         float(found.log_likelihood.sum()), rel=1e-8)

@@ -1,6 +1,5 @@
 """The accuracy report: importance weights against closed forms, and the Gaussian filter against exact likelihoods."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
@@ -359,12 +358,13 @@ def test_a_panel_is_the_sum_of_its_series():
 
 def test_enough_particles_are_found(bent):
     """The pilot raises the number until the noise is below its target."""
-    problem = rebuilding.problem(bent, well).at(np.arange(0, 400, 25))
+    problem = rebuilding.problem(bent, well).select(np.arange(0, 400, 25))
+    settings = likelihoods.ReferenceSettings("particles", None, 2)
     noise = lambda e: accuracy.noise(importance.average(e))  # noqa: E731
-    found = likelihoods.by_particles(problem, None, 2, None, jax.random.key(0), False, noise, 0.02, 1e12)
+    found = likelihoods.by_particles(problem, settings, noise, 0.02, 1e12)
     assert found.particles > 1000 and not found.limited
     assert noise(found.estimates) < 0.03
-    limited = likelihoods.by_particles(problem, None, 2, None, jax.random.key(0), False, noise, 0.001, 1e6)
+    limited = likelihoods.by_particles(problem, settings, noise, 0.001, 1e6)
     assert limited.particles == 1000 and limited.limited
 
 

@@ -1,1 +1,1 @@
-"""Prediction of satellite orbits with and without unmeasured forces."""
+"""OrbitPrediction of satellite orbits with and without unmeasured forces."""

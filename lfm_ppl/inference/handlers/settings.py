@@ -20,8 +20,8 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         fn: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
         **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping``, ``tolerance``, ``sites``,
             ``lower``, ``upper``, ``constraints``, ``grid`` and ``draws``; what is None or left out stays as the model
-            has it. But ``steps`` or ``iterations`` without a tolerance are steps of equal length, also where the model
-            has a tolerance; and a tolerance or constraints, which exclude iterations, end those of the model.
+            has it. But ``steps`` or ``iterations`` without a tolerance remove the tolerance of the model, and a
+            tolerance or constraints remove its iterations.
 
     Raises:
         TypeError: for a setting of another name.

@@ -60,10 +60,10 @@ def plot_accuracy(
     for axes in panels[: len(labels) + 1]:
         style.tidy(axes, x_ticks=3, y_ticks=3)
     _draw_ratios(panels[0], report)
-    at = np.searchsorted(group(result, "posterior")["draw"].values, report.dataset["draw"].values)
+    checked_columns = np.searchsorted(group(result, "posterior")["draw"].values, report.dataset["draw"].values)
     weight = np.exp(report.log_weight).ravel()
     for axes, label in zip(panels[1:], labels, strict=False):
-        _draw_densities(axes, draws[label], draws[label][:, at].ravel(), weight, _line(report))
+        _draw_densities(axes, draws[label], draws[label][:, checked_columns].ravel(), weight, _line(report))
         if label in table.index and report.reliable:
             _mark_means(axes, table.loc[label, "mean"], table.loc[label, "corrected_mean"])
         if label in truth:
@@ -107,14 +107,14 @@ def _draw_densities(
 ) -> None:
     flat = values.ravel()
     grid = np.linspace(*_range(flat, subset, weight), 200)
-    ends = flat.min(), flat.max()
-    before = _density(grid, flat, np.full(flat.size, 1.0 / flat.size), ends)
+    support = flat.min(), flat.max()
+    density = _density(grid, flat, np.full(flat.size, 1.0 / flat.size), support)
     width = _bandwidth(subset, weight, grid)
     # What the weights change on the subset, as for the moments: the subset's own chance cancels.
     equal = np.full(subset.size, 1.0 / subset.size)
-    change = _density(grid, subset, weight, ends, width) - _density(grid, subset, equal, ends, width)
-    axes.fill_between(grid, before, color=style.SKY, alpha=0.5, lw=0)
-    axes.plot(grid, np.maximum(before + change, 0.0), **line)
+    change = _density(grid, subset, weight, support, width) - _density(grid, subset, equal, support, width)
+    axes.fill_between(grid, density, color=style.SKY, alpha=0.5, lw=0)
+    axes.plot(grid, np.maximum(density + change, 0.0), **line)
     axes.set_ylim(0.0, None)
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
@@ -136,7 +136,7 @@ def _bandwidth(values: np.ndarray, weight: np.ndarray, grid: np.ndarray) -> floa
 
 
 def _density(
-    grid: np.ndarray, values: np.ndarray, weight: np.ndarray, ends: tuple[float, float],
+    grid: np.ndarray, values: np.ndarray, weight: np.ndarray, support: tuple[float, float],
     bandwidth: float | None = None
 ) -> np.ndarray:
     """Return a Gaussian kernel density estimate that is reflected at both ends, so that it keeps its mass in between.
@@ -145,15 +145,15 @@ def _density(
     """
     bandwidth = bandwidth or _bandwidth(values, weight, grid)
     total = np.zeros_like(grid)
-    for points in (grid, 2.0 * ends[0] - grid, 2.0 * ends[1] - grid):
+    for points in (grid, 2.0 * support[0] - grid, 2.0 * support[1] - grid):
         total += np.exp(-0.5 * ((points[:, None] - values) / bandwidth) ** 2) @ weight
     return total / (bandwidth * np.sqrt(2.0 * np.pi))
 
 
-def _mark_means(axes: Axes, before: float, after: float) -> None:
+def _mark_means(axes: Axes, posterior_mean: float, corrected_mean: float) -> None:
     """Mark the means under the densities."""
     where = axes.get_xaxis_transform()
-    for mean, colour in ((before, style.BLUE), (after, style.VERMILLION)):
+    for mean, colour in ((posterior_mean, style.BLUE), (corrected_mean, style.VERMILLION)):
         axes.plot(mean, 0.04, color=colour, marker="^", ms=4, mew=0, ls="", transform=where, zorder=4)
 
 

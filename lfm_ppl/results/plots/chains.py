@@ -25,7 +25,7 @@ def plot_trace(
     """Draw the trace and the ranks of each scalar parameter, side by side.
 
     Left, every chain over its draws, divergent transitions marked at the bottom, and the true value
-    where it is known. Right, for each chain the histogram of the ranks of its draws among those of
+    where it is known. Right, for each chain the histogram of the ranks of its draws among the draws of
     all chains; it is level (the dashed line) where the chains agree.
     Source of the rank plot: Vehtari et al. (2021), Bayesian Analysis 16(2), section 5.
 
@@ -150,7 +150,7 @@ def _draw_ranks(axes: Axes, draws: np.ndarray) -> None:
     level = count / (len(edges) - 1)
     scale = 0.9 / max(heights.max() / level, 1.8)
     for chain, colour in enumerate(_colours(chains)):
-        # One shape for all bars, where each by itself takes longer to draw than all else in the figure.
+        # One patch for all bars: separate bars take longer to draw than the rest of the figure.
         axes.stairs(chain + heights[chain] / level * scale, edges, baseline=chain, fill=True, color=colour)
         axes.axhline(chain + scale, color=style.BLACK, lw=0.5, ls=(0, (2, 2)))
     axes.set_xlim(0, draws.size)

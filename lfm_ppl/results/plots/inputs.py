@@ -45,7 +45,7 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
     """
     tables = {**inputs_of(result), **inputs_of(result, FORECAST)}
     if not tables:
-        raise ValueError("the result holds no known inputs. Give those of a model as columns of its data file, or in "
+        raise ValueError("the result holds no known inputs. Give them as columns of the data file, or in "
                          "lfm.Data(..., inputs=...).")
     selected = list(tables) if inputs is None else [inputs] if isinstance(inputs, str) else list(inputs)
     for name in selected:

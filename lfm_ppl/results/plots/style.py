@@ -130,7 +130,7 @@ class PlainNumbers(Formatter):
         self.unit = 10.0**power
 
     def __call__(self, x: float, pos: int | None = None) -> str:
-        """Return the label of one number by itself."""
+        """Return the label of a number outside of an axis."""
         return self.format_ticks([x])[0]
 
     def format_ticks(self, values: Sequence[float]) -> list[str]:
@@ -217,7 +217,7 @@ class Dates(Formatter):
         return next((kinds.pop() for form in _SHARED if len(kinds := {day.strftime(form) for day in dates}) == 1), "")
 
     def __call__(self, x: float, pos: int | None = None) -> str:
-        """Return the label of one time by itself, as under the mouse."""
+        """Return the label of a time outside of an axis, as under the mouse."""
         return num2date(float(self.days(x))).strftime("%Y-%m-%d %H:%M")
 
     def format_ticks(self, values: Sequence[float]) -> list[str]:

@@ -39,7 +39,7 @@ def plot_fit(
 
     The inner band holds 95% of the noise-free output, the outer one 95% of new measurements. Where the
     result has predictions, both go on after the last observation, which a dotted line marks, and the outer
-    band is theirs; forecasts at fewer than 12 times are drawn as bars. Bands are those of the summaries that the
+    band is theirs; forecasts at fewer than 12 times are drawn as bars. Bands follow the summaries that the
     trajectories hold; where they hold draws alone, they are quantiles of these, and the outer one ends with the data:
     it is exact at the measurement times, and between them the inner one widened by the difference of the two,
     interpolated linearly. Replicates are pooled. Of simulated data the noise-free truth is drawn, too.
