@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,8 @@ class Parameter(NamedTuple):
     help: str
 
 
-class Description(NamedTuple):
+@dataclass(frozen=True)
+class Description:
     """The description of a model.
 
     Attributes:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from lfm_ppl.cli import choices
 from lfm_ppl.io import loading
@@ -13,7 +14,8 @@ from lfm_ppl.io.data_set import Data
 from lfm_ppl.utils import checks
 
 
-class StoredFit(NamedTuple):
+@dataclass(frozen=True)
+class StoredFit:
     """A stored result, its model with keyword arguments, its data and its model file."""
 
     posterior: Any

@@ -211,8 +211,8 @@ def solve_nonlinear(problem: ConstrainedProblem, tolerance: float, max_passes: i
                     last.passes, last.is_finished & is_finite & ~is_violated.any())
 
 
-def _step(problem: ConstrainedProblem, dynamics: ConstrainedDynamics, margins: ConstraintMargins, iterate: InteriorPointIterate,
-          tolerance: float) -> InteriorPointIterate:
+def _step(problem: ConstrainedProblem, dynamics: ConstrainedDynamics, margins: ConstraintMargins,
+          iterate: InteriorPointIterate, tolerance: float) -> InteriorPointIterate:
     """Take one damped Gauss-Newton step with a line search on the merit function."""
     is_fixed, state = margins.is_fixed, iterate.primal
     # The disturbances belong to the new Q, so that the trajectory is rolled out again.

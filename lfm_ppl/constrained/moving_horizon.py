@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -28,7 +29,7 @@ import numpy as np
 from lfm_ppl.constrained.augmented import Rows, augmented_model
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
 from lfm_ppl.constrained.full_information import ConstrainedEstimate, check_settings, is_linear, solve_problem
-from lfm_ppl.constrained.gauss_newton import Dynamics
+from lfm_ppl.constrained.gauss_newton import ConstrainedDynamics
 from lfm_ppl.constrained.interior_point import ConstrainedProblem
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.forward import forward
@@ -63,7 +64,8 @@ class HorizonState(NamedTuple):
     covariance: jax.Array
 
 
-class HorizonEstimate(NamedTuple):
+@dataclass(frozen=True)
+class HorizonEstimate:
     """Estimate of one window.
 
     Attributes:
@@ -343,7 +345,7 @@ def _solve_window(settings: HorizonSettings, state: HorizonState) -> tuple[Const
     if settings.linear:
         # The maps of a linear model do not depend on the trajectory: they are computed once for all passes.
         nodes = jnp.zeros((settings.window + 1, settings.ssm.state_dim))
-        problem = dataclasses.replace(problem, transitions=Dynamics(problem).linearise(nodes))
+        problem = dataclasses.replace(problem, transitions=ConstrainedDynamics(problem).linearise(nodes))
     estimate, _ = solve_problem(problem, settings.constraints, settings.tolerance, settings.max_passes,
                                 settings.linear)
     return estimate, is_observed

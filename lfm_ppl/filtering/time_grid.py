@@ -12,7 +12,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -93,7 +94,7 @@ def _concrete_grid(ssm: StateSpaceModel, times: np.ndarray, origin: float, reque
     ssm.model.check_inputs(origin, end)
     reads = ssm.model.input_reads(origin, end)
     breakpoints, traced_breakpoints = breakpoints_within(reads, origin, end)
-    division = division._replace(
+    division = replace(division, 
         breakpoints=breakpoints, traced_breakpoints=len(traced_breakpoints), scale=_time_scale(reads),
         overhead=_OVERHEAD_OF_EXACT if ssm.time_invariant else _OVERHEAD,
         is_exact=ssm.mean_invariant and division.max_step is None and not division.interval_per_step)
@@ -108,7 +109,7 @@ def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_
     span = (0.0, 1.0) if concrete_times is None else (float(concrete_times[0]), float(concrete_times[-1]))
     reads = ssm.model.input_reads(*span)
     breakpoints = jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
-    division = division._replace(traced_breakpoints=len(breakpoints), scale=_time_scale(reads))
+    division = replace(division, traced_breakpoints=len(breakpoints), scale=_time_scale(reads))
     jumps, steps = ssm.stack.jump_times, division.steps
     if concrete_times is not None and jumps and division.max_step is None and requested_times is None:
         grid = _grid_from_traced_origin(concrete_times, initial_time, jumps, steps, division.interval_per_step)
@@ -125,7 +126,8 @@ def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_
                                       division.scale)
 
 
-class Division(NamedTuple):
+@dataclass(frozen=True)
+class Division:
     """How the time between two observations is divided into intervals.
 
     Attributes:

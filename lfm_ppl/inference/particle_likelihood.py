@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -103,7 +104,8 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         return ParticleLikelihood(likelihood, self.key, self.settings, self.steps)
 
 
-class Tuned(NamedTuple):
+@dataclass(frozen=True)
+class Tuned:
     """A number of particles, and the standard deviation of the log likelihood estimate that it gives."""
 
     particles: int

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -200,7 +201,8 @@ def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Arr
             "prediction": prediction}
 
 
-class _Plan(NamedTuple):
+@dataclass(frozen=True)
+class _Plan:
     """Times of the paths.
 
     Attributes:

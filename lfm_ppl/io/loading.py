@@ -32,7 +32,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType, ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 from lfm_ppl.io.data_set import INTERPOLATIONS, Data
 from lfm_ppl.utils import checks
@@ -321,7 +321,8 @@ def _convert(kind: type, text: str) -> Any:
     return kind(text)
 
 
-class SourceLocation(NamedTuple):
+@dataclass(frozen=True)
+class SourceLocation:
     """A line of a model file.
 
     Attributes:

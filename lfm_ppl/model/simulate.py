@@ -15,6 +15,7 @@ Source: Kloeden and Platen (1992), Numerical Solution of Stochastic Differential
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -109,7 +110,8 @@ def input_breakpoints(model: LatentForceModel, times: Any, start: Any) -> Any:
     return jnp.concatenate([fixed, traced]) if len(traced) else fixed
 
 
-class TimeNodes(NamedTuple):
+@dataclass(frozen=True)
+class TimeNodes:
     """Times at which the integration of a simulation is divided, including the rows.
 
     Attributes:

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -84,7 +84,8 @@ class Truncation:
     functions: int | None
 
 
-class RepresentativeRows(NamedTuple):
+@dataclass(frozen=True)
+class RepresentativeRows:
     """A few rows that represent a record.
 
     Attributes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,8 @@ class Unusable(ValueError):
     """A satellite that cannot be predicted or judged; the message says why."""
 
 
-class Arc(NamedTuple):
+@dataclass(frozen=True)
+class Arc:
     """A satellite and the part of its positions that may be learnt from.
 
     Attributes:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import date, datetime, timedelta
-from typing import NamedTuple
 
 import numpy as np
 
@@ -60,7 +59,8 @@ def calendar(epoch: float) -> str:
     return str(_ORIGIN + timedelta(seconds=float(epoch)))
 
 
-class Gap(NamedTuple):
+@dataclass(frozen=True)
+class Gap:
     """Epochs without a position, from the first to the last of them, in seconds of GPS time.
 
     Attributes:

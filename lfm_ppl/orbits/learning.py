@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +49,8 @@ _APART = 1.0
 """Hours between the values of a smoothed force that count: neighbours say much the same."""
 
 
-class Target(NamedTuple):
+@dataclass(frozen=True)
+class Target:
     """What is known of the magnitudes: a log density of their logarithms, up to a constant.
 
     Attributes:

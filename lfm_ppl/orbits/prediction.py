@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -70,7 +71,8 @@ def _from_latest(arc: Arc, end: int, solar: float) -> tuple[int, np.ndarray]:
     return first, propagate(arc.environment, orbit, arc.times[first:])
 
 
-class OrbitPrediction(NamedTuple):
+@dataclass(frozen=True)
+class OrbitPrediction:
     """What the latent force model says at all times, given some positions, averaged over magnitudes.
 
     Attributes:

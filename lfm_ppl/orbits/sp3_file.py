@@ -10,8 +10,8 @@ import gzip
 import re
 import zlib
 from collections.abc import Container
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,8 @@ _MJD_OF_GPS_ORIGIN = 44244
 _POSITION = re.compile(r"P...(?:[ \d-]{7}\.\d{6}){3}(?:(?: {14}|[ \d-]{7}\.[ \d]{0,6})[ \dEPM]{0,20})?")
 
 
-class Header(NamedTuple):
+@dataclass(frozen=True)
+class Header:
     """The header: the lines before the first epoch.
 
     Attributes:
@@ -53,7 +54,8 @@ class Header(NamedTuple):
     length: int
 
 
-class Sp3File(NamedTuple):
+@dataclass(frozen=True)
+class Sp3File:
     """A complete file.
 
     Attributes:
@@ -78,7 +80,8 @@ class Sp3File(NamedTuple):
         return self.start + (self.header.epochs - 1) * self.header.interval
 
 
-class _Text(NamedTuple):
+@dataclass(frozen=True)
+class _Text:
     """The lines of a file, and errors with line numbers from 1."""
 
     path: Path

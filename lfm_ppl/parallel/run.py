@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from lfm_ppl.parallel.cluster import Workers, check_workers, started
 from lfm_ppl.parallel.errors import TasksFailedError
@@ -16,7 +17,8 @@ from lfm_ppl.utils.progress import Progress, Reporter
 from lfm_ppl.utils.run_store import RunStore
 
 
-class Outcome(NamedTuple):
+@dataclass(frozen=True)
+class Outcome:
     """Result or error of a task.
 
     Attributes:

@@ -9,8 +9,9 @@ import os
 import pickle
 import platform
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib import metadata
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,7 +24,8 @@ from lfm_ppl.utils.compilation import ONE_THREAD
 _LIBRARIES = ("lfm_ppl", "jax", "jaxlib", "numpyro", "numpy")
 
 
-class Setup(NamedTuple):
+@dataclass(frozen=True)
+class Setup:
     """Settings of a process that reproduces the numbers of the client.
 
     Attributes:

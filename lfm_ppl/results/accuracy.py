@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
             "draws of the result": run_record.digest(*full_problem.draws.values()),
         }, resume)  # fmt: skip
     with checkpoints.closing(run):
-        problem = full_problem.select(rows)._replace(stores=None if run is None else run.batches)
+        problem = replace(full_problem.select(rows), stores=None if run is None else run.batches)
         settings = ReferenceSettings(kind, particles, replicates, steps, seed, progress)
         report = _report(result, problem, draw_index, settings)
     arviz_data.add_group(result, GROUP, report.to_dataset())
@@ -131,7 +132,7 @@ def _report(result: Any, problem: LikelihoodProblem, draw_index: np.ndarray,
     doubled = likelihoods.gaussian_with_finer_steps(problem).reshape(shape)
     iterated = None
     if (refinement := more_iterations(problem.example)) is not None:
-        refined = problem._replace(bound=problem.bound.approximate(**refinement.settings))
+        refined = replace(problem, bound=problem.bound.approximate(**refinement.settings))
         iterated = likelihoods.gaussian(refined, "log likelihoods with more iterations").reshape(shape)
     reference_values = _reference(problem, filtered, settings)
     return assess(result, draw_index, filtered, doubled, reference_values, problem, iterated)
@@ -170,7 +171,7 @@ def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: n
         sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.steps, max_step=example.max_step,
         tolerance=example.tolerance)
     if iterated is not None and (refinement := more_iterations(example)) is not None:
-        findings = findings._replace(
+        findings = replace(findings, 
             iterations=refinement.settings["iterations"], ratio_sd=_finite_sd(ratio),
             iterated_ratio_sd=_finite_sd(averaged.log_mean - iterated))
     verdict = judge(findings)

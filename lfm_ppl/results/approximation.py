@@ -15,7 +15,8 @@ The refined likelihood is not exact either: `lfm_ppl.check_accuracy` compares wi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -42,7 +43,8 @@ _MANY_ITERATIONS = 10
 """Iterations after which the linearisation of most models no longer changes."""
 
 
-class Refinement(NamedTuple):
+@dataclass(frozen=True)
+class Refinement:
     """Settings of a likelihood that is more accurate in one respect.
 
     Attributes:
@@ -98,7 +100,7 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
 
     def change(*selected: Refinement) -> float:
         settings = {name: value for refinement in selected for name, value in refinement.settings.items()}
-        refined = likelihoods.gaussian(problem._replace(bound=bound.approximate(**settings)))
+        refined = likelihoods.gaussian(replace(problem, bound=bound.approximate(**settings)))
         difference = refined - fitted
         return float(difference.std()) if np.isfinite(difference).all() else np.inf
 

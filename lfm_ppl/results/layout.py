@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 
 SERIES, OUTPUT = "series", "output"
 
-class Labels(NamedTuple):
+@dataclass(frozen=True)
+class Labels:
     """Names of dimensions, and of what stands along them.
 
     Attributes:

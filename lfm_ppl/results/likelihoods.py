@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,8 @@ _SCOUTS = 10
 """Number of draws whose models determine the grid: extremes of each parameter, and draws between."""
 
 
-class LikelihoodProblem(NamedTuple):
+@dataclass(frozen=True)
+class LikelihoodProblem:
     """A bound model, and draws of its parameters.
 
     Attributes:
@@ -75,10 +76,11 @@ class LikelihoodProblem(NamedTuple):
 
     def select(self, rows: Any) -> LikelihoodProblem:
         """Return the same problem with some of the draws."""
-        return self._replace(draws={name: value[rows] for name, value in self.draws.items()})
+        return replace(self, draws={name: value[rows] for name, value in self.draws.items()})
 
 
-class Reference(NamedTuple):
+@dataclass(frozen=True)
+class Reference:
     """Log likelihoods of a reference.
 
     Attributes:
@@ -166,7 +168,7 @@ def finer_steps(example: SeriesLikelihood) -> dict[str, Any]:
 def gaussian_with_finer_steps(problem: LikelihoodProblem) -> np.ndarray:
     """Return (S,): the log likelihoods of the Gaussian filter with about twice as many integration steps."""
     finer = problem.bound.approximate(**finer_steps(problem.example))
-    return gaussian(problem._replace(bound=finer), "log likelihoods with finer steps")
+    return gaussian(replace(problem, bound=finer), "log likelihoods with finer steps")
 
 
 def on_grid(problem: LikelihoodProblem, settings: ReferenceSettings) -> Reference:
@@ -219,7 +221,7 @@ def by_particles(problem: LikelihoodProblem, settings: ReferenceSettings, noise:
         rows = np.unique(np.linspace(0, problem.size - 1, _PILOT).round().astype(int))
         stores = problem.stores
         pilot_stores = None if stores is None else lambda name: stores(f"pilot {name}")
-        sd = noise(run(problem.select(rows)._replace(stores=pilot_stores), pilot_key))
+        sd = noise(run(replace(problem.select(rows), stores=pilot_stores), pilot_key))
         needed_particles = count * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
         time_grid = build_time_grid(example.ssm, example.times, settings.steps or example.steps, example.max_step)
         steps_made = np.shape(time_grid.intervals.length)[0] * time_grid.steps

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +37,8 @@ _SIGMAS = 2.0
 _NAMED = 4
 
 
-class Findings(NamedTuple):
+@dataclass(frozen=True)
+class Findings:
     """What a verdict rests on; see `lfm_ppl.results.accuracy.AccuracyReport` for the numbers.
 
     Attributes:

@@ -11,9 +11,9 @@ import contextlib
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import NamedTuple
 from urllib.parse import quote
 
 from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
@@ -70,7 +70,8 @@ figure img { display: block; max-width: 100%; height: auto; background: #ffffff;
 """
 
 
-class Section(NamedTuple):
+@dataclass(frozen=True)
+class Section:
     """A part of a page: its anchor, its title, and its HTML."""
 
     anchor: str

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -32,7 +33,8 @@ _LEAST_ROWS = 3
 _SCORES = ("rmse", "crps", "log_score")
 
 
-class Backtest(NamedTuple):
+@dataclass(frozen=True)
+class Backtest:
     """What `backtest` found.
 
     Attributes:

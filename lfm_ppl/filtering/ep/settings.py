@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from lfm_ppl.utils import checks
@@ -28,7 +29,8 @@ class SiteSettings(NamedTuple):
     relinearisations: int = 8
 
 
-class FixedPointOptions(NamedTuple):
+@dataclass(frozen=True)
+class FixedPointOptions:
     """Constants of the fixed-point iteration.
 
     Changes of a site are measured in units of its marginal: nu times the standard deviation, tau times the variance.
