@@ -1,4 +1,9 @@
-"""Commands and options of ``lfm-ppl``."""
+"""Commands and options of ``lfm-ppl``.
+
+1. `parser` builds a subparser for each command; related options share a function (`_add_data`, `_add_inference`, ...).
+2. For ``compare NAME`` the options of the study are added before parsing, from its settings.
+3. `parsed` parses; an unknown or empty option ends with one line that names similar options.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""``lfm-ppl check``: the error of the Gaussian filter in a saved posterior, and the corrected posterior."""
+"""``lfm-ppl check``: the error of the Gaussian filter in a saved posterior, and the corrected posterior.
+
+1. Rebuild the model and the data from the stored result.
+2. Compare the log likelihood of the filter with a reference at draws of the posterior (`lfm_ppl.check_accuracy`).
+3. Print the report, and store it in the result, as a table and as a figure.
+4. With --correct: resample the draws where their weights are reliable, else run exact chains.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""``lfm-ppl fit``: from a model and data to posterior, summary and figures."""
+"""``lfm-ppl fit``: from a model and data to posterior, summary and figures.
+
+1. Check all options and read model and data, before anything is computed.
+2. Print the task, and fit (`lfm_ppl.fit`); the checkpoint lies in the folder of the result.
+3. Write the posterior, the summary and then the figures and the report, so that a failure costs no draws.
+4. After Ctrl-C print the command that resumes the run.
+"""
 
 from __future__ import annotations
 

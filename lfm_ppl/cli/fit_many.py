@@ -1,4 +1,9 @@
-"""``lfm-ppl fit --each`` and ``--series``: one model fitted separately to many data sets."""
+"""``lfm-ppl fit --each`` and ``--series``: one model fitted separately to many data sets.
+
+1. Read all files, or all series of one file; data sets that cannot be read are reported as failed.
+2. Fit them (`lfm_ppl.fit_many`), inline or in several processes.
+3. Write a folder for each result, and one table and one file of posteriors for all.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""``lfm-ppl forecast``: new observations, with their noise, from a saved result."""
+"""``lfm-ppl forecast``: new observations, with their noise, from a saved result.
+
+1. Rebuild the model and the data from the stored result.
+2. Take the times of --until, --at or a file of held-out data, and its known inputs.
+3. Forecast (`lfm_ppl.forecast`), and score held-out data (`lfm_ppl.score`).
+4. Write the predictions into the result, a table and figures.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""Explain where and how a filter breaks down, by another pass, so that filters without a breakdown cost no more."""
+"""Messages on where and how a filter breaks down, by another pass, so that other filters cost no more.
+
+1. A log likelihood that is not finite, outside of compiled code, starts the search.
+2. Run the filter again and find the first row with moments or a log likelihood that are not finite.
+3. Divide this interval into its steps, and find the first bad step.
+4. State the reason (growth, a negative variance, a function that is not finite) and the remedy.
+"""
 
 from __future__ import annotations
 

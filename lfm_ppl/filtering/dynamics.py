@@ -1,4 +1,12 @@
-"""Linearisation of the dynamics at one time, with the constant linear part of the model removed."""
+"""Linearisation of the dynamics at one time, with the constant linear part of the model removed.
+
+1. The drift f(w, t) of w = K(t) s + k(t) has a constant linear part, which an integrating factor treats exactly.
+2. A rule linearises the remainder about Gaussian moments of the states that enter non-linearly; sparsity of the drift
+   determines these states.
+3. The result is embedded in the joint state: a Jacobian, a remainder of the mean, and the expectation of G G'.
+
+Source: Särkkä and Sarmavuori (2013), Signal Processing 93.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,10 @@
 """Prediction: the moments, and the affine map if it is recorded, over one interval of the scan.
 
-A linear time-invariant model has exact transitions. Any other model is integrated in equal steps, by `simpson` where
-only the forces enter non-linearly and by `runge_kutta` otherwise, or in steps that follow a tolerance (`adaptive`).
+1. A linear time-invariant model has an exact transition, tabulated by interval length.
+2. Any other model takes equal steps: Simpson's rule if only the forces enter non-linearly (`simpson`), else the
+   covariance-preserving Runge-Kutta method (`runge_kutta`); or steps that follow a tolerance (`adaptive`).
+3. About given linearisation points the prediction is an affine map, which is stored or composed.
+4. A jump of a force at the end of the interval is one more affine map.
 """
 
 from __future__ import annotations

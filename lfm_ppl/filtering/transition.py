@@ -4,8 +4,12 @@ The joint linear part
 
     d(x, z) = Lin (x, z) dt + noise,    Lin = [[J, B], [0, F]],
 
-holds the constant linear part of the dynamics and the forces. `exact` gives the transition of a model that has no
-other part. `integrating_factor` gives what one Runge-Kutta step over the rest needs.
+consists of the constant linear part of the dynamics and the forces.
+
+1. `linear_part` evaluates the constant Jacobian J, B of the drift.
+2. `exact` gives the transition of a model without any other part.
+3. `integrating_factor` gives the transitions over half and full steps, and the regressions of the noise of the steps on
+   the noise of the forces, for a Runge-Kutta step over the rest.
 """
 
 from __future__ import annotations

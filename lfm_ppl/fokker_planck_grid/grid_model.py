@@ -1,4 +1,12 @@
-"""A model with a one-dimensional state on the cells of a grid: rates, masses and likelihoods as arrays."""
+"""A model with a one-dimensional state on the cells of a grid: rates, masses and likelihoods as arrays.
+
+1. Drift and diffusion at the faces of the cells give the rates of a birth-death process (`finite_volume`).
+2. Rates that depend on time are evaluated at the middle of each step.
+3. Observation function and noise are evaluated at the nodes of each cell.
+4. A jump of a force is a transition matrix between cells.
+
+Source: Chang and Cooper (1970), Journal of Computational Physics 6.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""The likelihood of a NumPyro model, estimated by a particle filter in place of the Gaussian one."""
+"""The likelihood of a NumPyro model, estimated by a particle filter in place of the Gaussian one.
+
+1. `with_particles` replaces the likelihood site of a model by a `ParticleLikelihood` with a random key.
+2. Its log density is the logarithm of an unbiased estimate of the likelihood.
+3. `ParticlePotential` chooses the number of particles from the standard deviation of the estimate at one point.
+
+Source: Andrieu, Doucet and Holenstein (2010), Journal of the Royal Statistical Society B 72.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Observations as a user has them: a CSV file, a table of another library, or a simulated data set with its truth.
+"""Reading of data: a CSV file, a table of another library, or the series of one file.
 
-A table has a header, a time column, one column per output, and one per known input. Empty cells are missing values,
-repeated times are replicates; times are numbers, or dates. Every complaint names the file, the row as an editor counts
-it (the header is row 1), and the column.
+1. A table has a header, a time column, one column per output, and one per known input.
+2. Times are numbers or dates, and must not decrease; repeated times are replicates.
+3. Empty cells are missing values; a number that looks like a code of missing values raises a warning.
+4. Errors name the file, the row as an editor counts it (the header is row 1), and the column.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""Data sets: times, observations, known inputs, units, and the truth of simulated data."""
+"""Data sets: times, observations, known inputs, units, and the truth of simulated data.
+
+1. `Data` checks shapes, and converts dates to numbers in the model's unit of time.
+2. Known inputs are tables with an interpolation; blank cells are interpolated, or zero.
+3. Data sets of one record are put on one origin of time (`on_clock_of`).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Find, load and check model files: the shipped ones by name, a user's own by path.
+"""Find, load and check model files: shipped ones by name, others by path.
+
+1. Execute the file as a module of its own.
+2. Check the functions and constants that it defines, with the reason of a failure in one line.
+3. Call its functions with the arguments that they take.
 
 A model file is an ordinary Python file. It must define
 
@@ -7,14 +11,14 @@ A model file is an ordinary Python file. It must define
 and may define, each with a sensible default,
 
     simulate(seed=0, **options) -> lfm.Data     its default data
-    prepare(data) -> lfm.Data                   turns a user's file into what ``model`` takes
+    prepare(data) -> lfm.Data                   converts the data of a file for ``model``
     anchors(data) -> dict                       parameters that are fixed for such data unless freed
-    OUTPUTS      names of the outputs; None: any number of them, the columns of the data file
+    OUTPUTS      names of the outputs; None: the columns of the data file
     INPUTS       known inputs: name -> "previous", "linear" or "zero", how they are read, see `lfm_ppl.read_csv`
     UNITS        name -> unit
     OPTIONS      option -> (default, tuple of choices or a type, help)
     PARAMETERS   name of a sample site -> help, with its unit
-    TARGET_ACCEPT    acceptance that NUTS aims at, where its own 0.8 makes steps too long
+    TARGET_ACCEPT    target acceptance of NUTS, if the default makes its steps too long
 
 A ``model`` with an argument ``outputs`` or ``units`` gets the names of the outputs and the
 units of the data, for ``LatentForceModel(..., output_names=outputs, units=units)``. One that has an argument ``inputs``

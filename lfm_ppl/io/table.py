@@ -1,4 +1,9 @@
-"""A table of cells, wherever it comes from: a CSV file, pandas, polars, xarray, or a mapping of columns."""
+"""A table of cells, from a CSV file, pandas, polars, xarray, or a mapping of columns.
+
+1. `from_csv` reads the cells as text, with the row numbers of the file.
+2. `from_frame` reads the columns of a data frame, a dataset or a mapping, without importing its library.
+3. Names of columns must be unique and not empty.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,12 @@
-"""Orbits without unknown forces: gravity, and sunlight of a constant amplitude."""
+"""Orbits without unknown forces: gravity, and sunlight of a constant amplitude.
+
+1. Propagate position and velocity by the classical Runge-Kutta method in equal steps.
+2. Fit state and amplitude to positions by the Gauss-Newton method; derivatives are taken in forward mode through the
+   propagation.
+3. Start at a polynomial through the first nine positions.
+
+Source: Montenbruck and Gill (2000), Satellite Orbits, chapters 3, 4 and 8.
+"""
 
 from __future__ import annotations
 

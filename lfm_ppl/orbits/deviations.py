@@ -1,4 +1,9 @@
-"""Small departures from a known orbit: a linear latent force model, far cheaper than the satellite itself."""
+"""Small departures from a known orbit: a linear latent force model, much cheaper than the satellite itself.
+
+1. Differentiate the acceleration by state and forces along the orbit, by automatic differentiation.
+2. Tabulate the derivatives at equally spaced nodes, as means over an interval where the Earth's shadow makes them jump.
+3. The departure is linear in state and forces, with coefficients that depend on time.
+"""
 
 from __future__ import annotations
 

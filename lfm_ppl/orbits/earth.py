@@ -1,4 +1,11 @@
-"""How the Earth turns: from the celestial frame (GCRS) to the terrestrial one (ITRS)."""
+"""Rotation of the Earth: from the celestial frame (GCRS) to the terrestrial one (ITRS).
+
+1. Interpolate the measured Earth orientation (UT1 - UTC, polar motion, celestial pole) of the IERS.
+2. Tabulate precession, nutation and rotation angle by the routines of the IAU at equally spaced nodes.
+3. Compiled code interpolates the table and composes the rotation matrices.
+
+Source: Petit and Luzum (2010), IERS Conventions, chapter 5.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Positions of satellites at equally spaced epochs, and the GPS time that counts them.
+"""Positions of satellites at equally spaced epochs, and the GPS time of the epochs.
 
-GPS time runs with atomic time, TAI - 19 s, and has no leap seconds. It is ahead of UTC by as many leap seconds as there
-were since 1980: 18 s since 2017.
+1. GPS time runs with atomic time, TAI - 19 s, and has no leap seconds. It is ahead of UTC by the leap seconds since
+   1980: 18 s since 2017.
+2. `Ephemerides` holds positions (epochs, satellites, 3) with NaN for gaps, and converts epochs to dates.
 """
 
 from __future__ import annotations

@@ -1,4 +1,11 @@
-"""The Earth's gravity field: spherical harmonics to degree and order eight."""
+"""The Earth's gravity field: spherical harmonics to degree and order eight.
+
+1. Positions are in the frame that rotates with the Earth.
+2. Compute the solid harmonics V_nm, W_nm by a recursion over the degree, for all orders at a time.
+3. The acceleration is a linear combination of the harmonics of one degree more, with constant weights.
+
+Source: Montenbruck and Gill (2005), Satellite Orbits, section 3.2; coefficients of EGM2008, Pavlis et al. (2012).
+"""
 
 from __future__ import annotations
 

@@ -1,12 +1,13 @@
-"""Learning the magnitudes of the small forces from the positions of training alone.
+"""Learning the magnitudes of the small forces from the positions of training.
 
-Published positions are smoothed by a dynamic model, so that they scatter far less than they are wrong, and the
-marginal likelihood of positions has the forces explain what is left. What counts here is how well held-out positions
-are predicted: from the first third of the training its other two, and from two thirds the last one. Magnitudes weigh
-by exp(WEIGHT * their mean log predictive density) times a prior, whose mode and curvature are found. The prior is what
-satellites have in common: each is learnt separately first, then again with the mean and scatter of all.
-
-All this runs on departures from an orbit, as a linear regression: see `training`.
+1. Published positions come from a dynamic model, so that they scatter much less than their error. The marginal
+   likelihood would therefore let the forces explain the errors.
+2. The criterion is the prediction of held-out positions: from the first third of the training the rest, and from two
+   thirds the last third.
+3. Magnitudes have the weight exp(WEIGHT * mean log predictive density) times a prior; its mode and curvature are
+   computed.
+4. Each satellite is learnt with a wide prior first, then again with the mean and scatter of all satellites as prior.
+5. All this runs on departures from an orbit, as a linear regression (`training`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,12 @@
-"""One satellite, predicted by the deterministic model and by the latent force model."""
+"""One satellite, predicted by the deterministic model and by the latent force model.
+
+1. Fit an orbit to the positions of training; its propagation is the deterministic prediction.
+2. Smooth the departures from this orbit in training, and predict them afterwards, for each draw of the magnitudes.
+3. The mean and covariance over the draws are the prediction of the latent force model.
+4. Online: filter positions as they arrive, and restart the deterministic model from the latest state.
+
+Source: Hartikainen, Seppänen and Särkkä (2012), section 6.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,12 @@
-"""A satellite as a latent force model: known gravity, and small unmeasured forces."""
+"""A satellite as a latent force model: known gravity, and small unmeasured forces.
+
+1. The state is position and velocity; the acceleration is the gravity of Earth, Moon and Sun plus small forces along
+   axes that turn with the satellite.
+2. Each small force is a level plus resonators at multiples of the orbital frequency.
+3. The prior of the initial state comes from a polynomial through the first positions.
+
+Source: Hartikainen, Seppänen and Särkkä (2012), section 6.
+"""
 
 from __future__ import annotations
 

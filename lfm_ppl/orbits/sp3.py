@@ -1,4 +1,9 @@
-"""Orbits from SP3 files: the files of several days, put together."""
+"""Orbits from SP3 files: the files of consecutive days, joined.
+
+1. Read the files (`sp3_file`), in the order of their first epochs.
+2. Check that interval, frame and time system agree, and that no span is missing.
+3. Join the positions; files that share an epoch must agree within a tolerance.
+"""
 
 from __future__ import annotations
 

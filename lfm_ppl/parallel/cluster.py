@@ -1,4 +1,10 @@
-"""Workers by Dask: processes of this machine, or the workers of a scheduler. Dask is imported when it is used."""
+"""Workers by Dask: processes of this machine, or the workers of a scheduler. Dask is imported when it is used.
+
+1. `started` starts a local cluster, or connects to a scheduler and checks versions and threads of its workers.
+2. `Cluster.computed` submits one task per worker, and another one when a task ends.
+3. A task whose worker dies is submitted again by Dask; after four deaths it has failed.
+4. Similar tasks on this machine wait for the first one, whose compiled programs they share.
+"""
 
 from __future__ import annotations
 

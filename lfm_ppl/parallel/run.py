@@ -1,4 +1,9 @@
-"""Computation of tasks whose results are stored one by one, so that a stopped run can be resumed."""
+"""Computation of tasks whose results are stored one by one, so that a stopped run can be resumed.
+
+1. Lock the folder, and read the stored results of the tasks.
+2. Compute the missing ones in this process or by workers.
+3. Store each result in a file as it ends, and yield it; a failed task does not stop the others.
+"""
 
 from __future__ import annotations
 

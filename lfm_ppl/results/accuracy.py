@@ -1,4 +1,13 @@
-"""How wrong is a posterior of the Gaussian filter? Its likelihood against an exact one, and what follows."""
+"""The error of a posterior that was sampled with the Gaussian filter's likelihood.
+
+1. At draws of the posterior compute the log likelihood of the filter, also with half the step and more iterations.
+2. Compute the log likelihood of a reference: exact for linear models, a Fokker-Planck grid for one state, else
+   replicates of a particle filter.
+3. Smooth the importance weights (Pareto), and correct the moments of the parameters.
+4. `judge` turns the numbers into a verdict: trust, corrected or re-run.
+
+Source: Vehtari et al. (2024), JMLR 25(72); Andrieu and Roberts (2009), Annals of Statistics 37(2).
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,9 @@
 """The result of a fit as an ArviZ object, on ArviZ 0.23 and on ArviZ 1.x.
 
-ArviZ 0.23 keeps groups in an ``InferenceData``, ArviZ 1.x in an ``xarray.DataTree``. This module
-alone knows the difference; everything else asks for a group by name and gets an xarray dataset.
+1. ArviZ 0.23 keeps groups in an ``InferenceData``, ArviZ 1.x in an ``xarray.DataTree``. Only this module depends on
+   the difference: other modules get and set groups, xarray datasets, by name.
+2. `save` and `load` write and read netCDF files, atomically.
+3. `summary` tabulates the scalar parameters; `convergence_warnings` checks the chains.
 """
 
 from __future__ import annotations

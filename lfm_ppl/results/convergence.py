@@ -1,4 +1,11 @@
-"""What a summary table says about convergence, in words and with a remedy."""
+"""Warnings on the convergence of chains, and their remedies.
+
+1. R-hat and effective sample sizes of all scalars are compared with thresholds.
+2. Divergences, unconverged sites and few weighted trajectories give further messages.
+3. Each message names the number, its threshold and the remedy.
+
+Source: Vehtari et al. (2021), Bayesian Analysis 16.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""A result on one page: ``report.html``, to read, to send, and to do it all again from."""
+"""The report of a result, ``report.html``: one page without network access or scripts.
+
+1. Collect the sections from the groups and attributes of a result: model, data, fit, table, figures, settings.
+2. Draw the figures, or use the files that exist.
+3. Render the page (`lfm_ppl.results.web_page`), and write it atomically.
+"""
 
 from __future__ import annotations
 

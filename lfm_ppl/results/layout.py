@@ -1,4 +1,9 @@
-"""Draws, trajectories and scores of a bound model as the groups of a result, with names for every axis."""
+"""Layout of the groups of a result: variables, dimensions, coordinates and units.
+
+1. Name the dimensions of each site by plates, outputs, or the user's labels.
+2. Lay out posterior, sampler statistics, observed data, scores, trajectories, predictions and truth as datasets.
+3. Add means and 95% intervals to trajectories, from the mixture of normal distributions over the draws.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""Log likelihoods at draws of the parameters: of the Gaussian filter, and of what it is measured against."""
+"""Log likelihoods at posterior draws: of the Gaussian filter, and of references.
+
+1. The Gaussian filter, with its own steps, with half of them, and as stored in a result.
+2. A Fokker-Planck grid for models of one state; one grid serves all draws.
+3. A particle filter; a pilot run chooses the number of particles. Linear models with an observation family use
+   importance sampling by draws of the smoother instead.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The group ``predictions`` of a result: new observations, with their noise, at times that were asked for."""
+"""The group ``predictions`` of a result: new observations, with their noise, at requested times.
+
+1. Lay out draws of new observations, of noise-free outputs and of the paths.
+2. Intervals are quantiles of the mixture of normal distributions over the draws, by bisection; of draws otherwise.
+3. `summary` gives one row per time and output.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The accuracy report: what a result stores of it, and how it reads."""
+"""The accuracy report: its numbers as a dataset, and as text.
+
+1. `AccuracyReport` wraps the group ``accuracy`` of a result.
+2. `text` prints reference, table, verdict and remedies.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Tables for the terminal, for Markdown, for a page in a browser (HTML) and for other programs (CSV)."""
+"""Tables for the terminal, Markdown, HTML and CSV.
+
+1. `format_number` gives numbers with a fixed number of significant digits.
+2. `text_table` breaks wide tables into blocks that fit the terminal.
+3. Files are written atomically.
+"""
 
 from __future__ import annotations
 

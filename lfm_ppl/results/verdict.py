@@ -1,4 +1,9 @@
-"""What the numbers of an accuracy report mean, in words, and what to do next."""
+"""The verdict of an accuracy report: trust, corrected or re-run, with the reason and the remedies.
+
+1. Steps that are too long come first: the verdict is re-run with the command.
+2. Unreliable weights: remedies by cost; more iterations if they bring the likelihood closer, else exact chains.
+3. Reliable weights: corrected if a mean or an sd changes noticeably, else trust.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""One HTML page that needs nothing but itself: no network, no script; style and pictures are in it.
+"""One HTML page without network access or scripts; style and pictures are part of it.
 
-It reads in light and dark, on a phone, on a desktop and on paper. What comes from a user is escaped here, so that a
-caller passes plain text; only `Section.body` is HTML, made by the functions below and `lfm_ppl.results.tables`.
+1. It is readable in light and dark mode, on a phone, on a desktop and on paper.
+2. Text of users is escaped here: callers pass plain text. Only `Section.body` is HTML, made by the functions below and
+   by `lfm_ppl.results.tables`.
 """
 
 from __future__ import annotations

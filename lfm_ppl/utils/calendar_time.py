@@ -1,8 +1,10 @@
 """Calendar time: dates and times of day as numbers of a unit since an origin, and back.
 
-The origin is the midnight before the first time, on the clock of the data, so that a force with a daily or weekly
-period knows the time of day. Differences refer to absolute time: with an offset from UTC in every row, changes to
-and from summer time are counted correctly.
+1. The origin is the midnight before the first time, on the clock of the data, so that the phase of a force with a daily
+   or weekly period is the time of day.
+2. Differences refer to absolute time: with an offset from UTC in every row, changes to and from summer time are counted
+   correctly.
+3. Inside `in_messages`, messages show times as dates.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""From draws that a user made with NumPyro alone to the result that `fit` would have given."""
+"""The draws of a plain NumPyro run as a result of `lfm_ppl.fit`.
+
+1. Bind the model to its data, and take draws and statistics from the MCMC object or a dictionary.
+2. Compute missing deterministic sites, scores and trajectories.
+3. Lay out the ArviZ groups as `lfm_ppl.fit` does.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Figures of the study: bands of the day ahead, daily residuals, and scores of all residuals."""
+"""Figures of the study: bands of the day ahead, daily residuals, and scores of all residuals.
+
+1. A day of a simulated home and of the real house: temperature with bands, and heating.
+2. The smoothed residual of each day, and the band of the predicted day.
+3. RMSE of every residual, and quartiles of the log likelihood.
+"""
 
 from __future__ import annotations
 

@@ -2,9 +2,9 @@
 
 With the smoothed marginal q of an entry, its cavity q_-i = q / t_i^a and its factor p_i,
 
-    expectation propagation   t_i^a = (Gaussian of the moments of q_-i p_i^a) / q_-i,
-    variational               nu, tau from the derivatives of E_q log p_i by the mean and the variance of q,
-    Laplace                   nu, tau from the derivatives of log p_i at the mean of q.
+1. expectation propagation:  t_i^a = (Gaussian with the moments of q_-i p_i^a) / q_-i,
+2. variational:              nu, tau from the derivatives of E_q log p_i by the mean and the variance of q,
+3. Laplace:                  nu, tau from the derivatives of log p_i at the mean of q.
 
 Source: Minka (2001), A family of algorithms for approximate Bayesian inference; Khan and Lin (2017), AISTATS.
 """

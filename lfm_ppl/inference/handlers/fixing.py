@@ -1,8 +1,8 @@
 """Fix parameters of a NumPyro model: a whole site, or single elements of a vector site.
 
-A site that is fixed as a whole is conditioned on, as ``numpyro.handlers.condition`` does. A site of
-which elements are fixed keeps its name and its shape, so that coordinates and predictive draws work
-as before, and its distribution becomes that of the free elements given the fixed ones.
+1. Names such as ``decay[CDKN1A]`` are split into site and element; labels are positions, or names of outputs.
+2. A whole site is conditioned on, as by ``numpyro.handlers.condition``.
+3. Otherwise the site keeps its name and shape, and its distribution is conditioned on the fixed elements (`pinned`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """A distribution over a vector, given the values of some of its elements.
 
-NumPyro conditions whole sites. Here single elements are fixed: the distribution is restricted to
-the affine set where they have their values, and the bijection onto that set has as many
-unconstrained coordinates as there are free elements, so that a sampler never sees the fixed ones.
+1. NumPyro conditions whole sites. Here the distribution is restricted to the affine set of vectors with the given
+   elements; its density is the base density.
+2. The bijection onto this set has one unconstrained coordinate per free element, so that samplers never see fixed ones.
+3. Only supports that treat elements separately are possible.
 """
 
 from __future__ import annotations

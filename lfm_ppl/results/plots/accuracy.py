@@ -1,4 +1,10 @@
-"""Figure of the accuracy report: the importance ratios, and each parameter before and after correction."""
+"""Figure of the accuracy report: log ratios, and densities before and after the correction.
+
+1. Log ratio of reference and filter against the log likelihood of the filter, with the noise of the reference.
+2. For each parameter the density of all draws, and the density changed by the weights of the checked draws.
+
+Source: Silverman (1986), Density Estimation, section 2.10.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""Figure of the chains: a trace and a rank plot for each scalar parameter."""
+"""Figure of the chains: traces and rank histograms of each scalar parameter.
+
+1. Left, every draw in its order, with divergences marked.
+2. Right, the ranks of the draws of each chain among all draws, one histogram above the other.
+
+Source: Vehtari et al. (2021), Bayesian Analysis 16.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Figure of the joint posterior: scatter plots of every pair of scalar parameters."""
+"""Figure of the joint posterior: scatter plots of every pair of scalar parameters.
+
+1. Histograms of the marginals on the diagonal, scatter plots below it.
+2. Divergent draws and the truth are marked; axes share their labels along rows and columns.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""Figure of the one-step-ahead residuals: over time, against the normal, and their whiteness."""
+"""Figure of the one-step-ahead residuals: over time, against the normal, and their whiteness.
+
+1. Left, the posterior mean of the residuals over time.
+2. Middle, their quantiles against normal quantiles with a pointwise band.
+3. Right, their autocorrelations with a 95% band, and the p-value of the Ljung-Box test.
+
+Source: Ljung and Box (1978), Biometrika 65.
+"""
 
 from __future__ import annotations
 

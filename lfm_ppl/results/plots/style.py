@@ -1,4 +1,11 @@
-"""One look for all figures: sizes of a paper, colours that colour-blind readers can tell apart."""
+"""The style of all figures: sizes of a paper, colours for colour-blind readers.
+
+1. `styled` makes a figure function use the style without changing the global one.
+2. Figures are made outside of pyplot, so that nothing keeps them in memory.
+3. Ticks, dates, scales and long names are formatted for narrow columns.
+
+Source: Okabe and Ito (2008), Color Universal Design, for the colours.
+"""
 
 from __future__ import annotations
 

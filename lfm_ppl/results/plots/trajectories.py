@@ -1,4 +1,9 @@
-"""Figures over time: the fit to the data, the forces, the states."""
+"""Figures over time: the fit to the data, the forces, the states.
+
+1. Select the trajectories of one kind, and their predictions.
+2. Draw the mean and the 95% band, from the mixture over the draws if it is stored, else from the draws.
+3. Draw forecasts after the last observation, missing values, held-out data and the truth.
+"""
 
 from __future__ import annotations
 
