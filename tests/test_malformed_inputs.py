@@ -349,7 +349,7 @@ RESULTS_OF_FIT = {
                                    {"out/checkpoint/run.json": '{"sampler": "nu'}),
     "resume a record of words": Case("fit model.py --out out --resume", ("out/checkpoint/run.json",),
                                      {"out/checkpoint/run.json": "7"}),
-    "resume another's result": Case("fit model.py --out result --resume", ("does not say which run it is from",)),
+    "resume another's result": Case("fit model.py --out result --resume", ("has no record of its run",)),
     "resume a broken result": Case("fit model.py --out out --resume", ("posterior.nc could not be read",),
                                    {"out/posterior.nc": b"\x89HDF\r\n\x1a\n cut"}),
 }
@@ -535,7 +535,7 @@ RESULTS = {
                                                {"cut.nc": f"without {group}"})
        for command, more in (("check", ""), ("forecast", " --until 9"))
        for group, said in (("posterior", "holds no posterior"), ("observed_data", "no group 'observed_data'"))},
-    "check: an unfinished run": Case("check begun", ("begun holds a run that is not finished", "--resume"),
+    "check: an unfinished run": Case("check begun", ("begun holds an unfinished run", "--resume"),
                                      {"begun/checkpoint/run.json": "{}"}),
     "plot: nothing to draw": Case("plot cut.nc", ("cut.nc holds no posterior",), {"cut.nc": "without posterior"}),
     **{f"{command}: its model has moved": Case(f"{command} moved.nc{more}", ("no model file", "name it with --model"),
@@ -591,7 +591,7 @@ RESULTS = {
     "forecast: inputs of none": Case("forecast result --held-out d.csv --inputs heater",
                                      ("--inputs", "no known inputs; leave it out"),
                                      {"d.csv": "time,x,heater\n4,1,1\n"}),
-    "forecast: a table is there": Case("forecast result --until 9", ("forecast.csv exists already",),
+    "forecast: a table is there": Case("forecast result --until 9", ("forecast.csv already exists",),
                                        {"result/forecast.csv": "keep"}),
     "forecast: into files": Case("forecast result --until 9 --out sub", ("sub exists and holds files",),
                                  {"sub/mine": "keep"}),
@@ -615,7 +615,7 @@ OTHERS = {
     "simulate: no such option": Case("simulate model.py --option dept=1", ("unknown option", "'depth'")),
     "simulate: a file is there": Case("simulate model.py --out d.csv", ("d.csv already exists",),
                                       {"d.csv": "keep"}),
-    "simulate: a truth is there": Case("simulate model.py --out d.csv", ("d.truth.json exists already",),
+    "simulate: a truth is there": Case("simulate model.py --out d.csv", ("d.truth.json already exists",),
                                        {"d.truth.json": "keep"}),
     "simulate: a folder": Case("simulate model.py --out sub", ("sub is a folder",), {"sub/keep": "keep"}),
     "simulate: nowhere to write": Case("simulate model.py --out /proc/d.csv", ("cannot write", "/proc")),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from lfm_ppl.utils import checks
 
@@ -35,7 +36,8 @@ _STUDIES = {
 """Name -> module and summary; texts, since the modules take seconds to import."""
 
 
-class CatalogueEntry(NamedTuple):
+@dataclass(frozen=True)
+class CatalogueEntry:
     """Entry of the catalogue for a study.
 
     Attributes:

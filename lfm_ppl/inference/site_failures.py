@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, cast
+from dataclasses import dataclass
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -20,7 +21,8 @@ _WEIGHT_DRAWS = 25
 """Draws at which the weights of trajectories are computed."""
 
 
-class SiteFailures(NamedTuple):
+@dataclass(frozen=True)
+class SiteFailures:
     """Counts of points at which sites do not converge or the likelihood is zero.
 
     Attributes:
@@ -34,7 +36,8 @@ class SiteFailures(NamedTuple):
     impossible: int
 
 
-class PathESS(NamedTuple):
+@dataclass(frozen=True)
+class PathESS:
     """Effective sample size of the weighted trajectories in the evidence under constraints, over posterior draws.
 
     Attributes:

@@ -10,7 +10,7 @@ Source: Petit and Luzum (2010), IERS Conventions, chapter 5.
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -25,7 +25,8 @@ _SPACING = 3.0  # hours; the cubic through it is within 1e-12 rad for the nutati
 _MARGIN = 4
 
 
-class Orientation(NamedTuple):
+@dataclass(frozen=True)
+class Orientation:
     """Earth orientation parameters at some epochs, each (K,).
 
     Attributes:

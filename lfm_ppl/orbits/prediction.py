@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +40,8 @@ _STEP = 0.125
 _Z = norm.ppf(0.975)
 
 
-class Deterministic(NamedTuple):
+@dataclass(frozen=True)
+class Deterministic:
     """Paths (T, 6) without unknown forces, and how they were found.
 
     Attributes:

@@ -43,7 +43,7 @@ class RunStore:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     store = RunStore(folder)
-        ...     store.put("draws", {"x": np.arange(3)})
+        ...     _ = store.put("draws", {"x": np.arange(3)})
         ...     store.get("draws")["x"].tolist(), store.get("scores")
         ([0, 1, 2], None)
     """

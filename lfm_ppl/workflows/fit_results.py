@@ -16,7 +16,7 @@ import json
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
@@ -168,7 +168,7 @@ def _site_attributes(bound: BoundModel, draws: PosteriorDraws, values: Mapping[s
         reports[arviz_data.SITES] = best_effort("convergence of the sites", lambda: failures_at(bound, values), None)
     reports[arviz_data.WEIGHTS] = best_effort(
         "weights under the constraints", lambda: path_ess(bound, values), None)
-    return {name: json.dumps(report) for name, report in reports.items() if report is not None}
+    return {name: json.dumps(astuple(report)) for name, report in reports.items() if report is not None}
 
 
 def draw_paths(key: jax.Array, bound: BoundModel, values: Mapping[str, np.ndarray], requested_times: Any, count: int,

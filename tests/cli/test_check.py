@@ -94,7 +94,7 @@ def test_check_prints_stores_and_draws(run, fitted):
     np.testing.assert_allclose(table.loc["depth", "shift"], report.table.loc["depth", "shift"])
     assert (fitted / "accuracy.png").stat().st_size > 10_000
     code, _, err = run(f"check {fitted} --draws 40")
-    assert code == 2 and "accuracy.csv exists already" in err and "--overwrite" in err
+    assert code == 2 and "accuracy.csv already exists" in err and "--overwrite" in err
     code, out, _ = run(f"plot {fitted} --overwrite")
     assert code == 0 and "accuracy.png" in out
 

@@ -105,7 +105,7 @@ def test_predictions_that_exist_are_replaced_only_if_asked(result, capsys):
 
 
 @pytest.mark.parametrize(("flags", "message"), [
-    ("", "say what to forecast"), ("--until 3", "after the last observation, at 5"),
+    ("", "no times to forecast"), ("--until 3", "after the last observation, at 5"),
     ("--at soon", "Separate times by commas"), ("--at 7,inf", "finite times, separated by commas"),
     ("--at 7 --outputs x", "--outputs is about a data file"), ("--held-out none.csv", "none.csv"),
     ("--at -4", "initial time"),

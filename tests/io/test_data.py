@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from lfm_ppl.io.data import read_csv, read_series, read_table, write_csv, write_truth
+from lfm_ppl.io.data import read_csv, read_series, read_table, write_csv
 from lfm_ppl.io.data_set import Data
-from lfm_ppl.io.truth import read_truth
+from lfm_ppl.io.truth import read_truth, write_truth
 
 P53 = """time_h,replicate,DDB2,CDKN1A
 0,1,211.6,5.9

@@ -214,13 +214,13 @@ def wider(times, y=None):
     ({"sampler_options": {"target_accept_prob": 0.5}}, "sampler_options target_accept_prob was not given and is 0.5"),
     ({"chain_method": "sequential"}, "chain_method was vectorized and is sequential"),
     ({"init": "map"}, "init was not given and is map"),
-    ({"model": approximate(well, steps=2)}, "another one: steps was 1 and is 2. Repeat"),  # and no word of the model
+    ({"model": approximate(well, steps=2)}, "this one: steps was 1 and is 2. Use"),  # and no word of the model
 ])
 def test_another_run_is_not_gone_on_with(unfinished, changes, message):
     before = {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()}
     with pytest.raises(ValueError, match="cannot resume the run in .*run, which differs from this one: ") as raised:
         fit("ram", checkpoint=unfinished, resume=True, **changes)
-    assert message in str(raised.value) and "Repeat what it was begun with" in str(raised.value)
+    assert message in str(raised.value) and "Use the settings of that run" in str(raised.value)
     assert {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()} == before
 
 

@@ -13,7 +13,8 @@ the mean of the smoothers' prior, 65 km and 3 km/s.
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +45,8 @@ RECORDS_PER_SEED = 10_000
 """Number of targets for one seed of the study."""
 
 
-class SimulatedTarget(NamedTuple):
+@dataclass(frozen=True)
+class SimulatedTarget:
     """A simulated target.
 
     Attributes:

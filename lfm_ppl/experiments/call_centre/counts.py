@@ -12,8 +12,9 @@ Source of the equation: Reece and others (2014), JMLR 15, section 8.
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -42,7 +43,8 @@ class OverloadWarning(UserWarning):
     """More customers arrive than are served, for hours."""
 
 
-class CallCounts(NamedTuple):
+@dataclass(frozen=True)
+class CallCounts:
     """Days of the call centre.
 
     Attributes:

@@ -18,7 +18,8 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -155,7 +156,8 @@ def horizon(values: jax.Array, y: jax.Array) -> jax.Array:
     return jax.lax.dynamic_update_slice(estimate, window(last, estimate[last])[half:], (last + half, 0))
 
 
-class Method(NamedTuple):
+@dataclass(frozen=True)
+class Method:
     """An estimator of the transcription factor.
 
     Attributes:

@@ -11,7 +11,8 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -57,7 +58,8 @@ _FINE = 10
 """Cells of the simulation between two samples."""
 
 
-class TranscriptionRecord(NamedTuple):
+@dataclass(frozen=True)
+class TranscriptionRecord:
     """A record: the measured concentration ``y`` (T, 1), and the true ``force`` (T,)."""
 
     y: np.ndarray

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +32,8 @@ MAX_REALISATIONS = 10_000
 """Largest number of realisations for one seed of the study."""
 
 
-class Realisation(NamedTuple):
+@dataclass(frozen=True)
+class Realisation:
     """A simulated path and its observations.
 
     Attributes:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,8 @@ SYSTEMS = {"G": "GPS", "R": "GLONASS", "E": "Galileo", "C": "BeiDou", "J": "QZSS
 """First letter of a satellite's name -> constellation."""
 
 
-class Arcs(NamedTuple):
+@dataclass(frozen=True)
+class Arcs:
     """Positions in celestial axes.
 
     Attributes:

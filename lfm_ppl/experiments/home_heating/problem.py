@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,7 +56,8 @@ _VARIED = ("alpha", "beta", "scale", "gamma", "psi")
 _METER_ERROR, _FUNCTIONS = 1e-3, 15
 
 
-class Window(NamedTuple):
+@dataclass(frozen=True)
+class Window:
     """Five days of a home.
 
     Attributes:

@@ -10,7 +10,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +44,8 @@ LEVELS = {"noise_sd": problem.NOISE, "lengthscale": problem.LENGTHSCALE}
 NAMES = (*(f"{name}[{gene + 1}]" for name in UNIFORM for gene in range(problem.GENES)), *LEVELS)
 
 
-class SamplerConfiguration(NamedTuple):
+@dataclass(frozen=True)
+class SamplerConfiguration:
     """A kernel and its model.
 
     Attributes:

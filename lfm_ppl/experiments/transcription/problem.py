@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -101,7 +102,8 @@ def on_grid(link: str, gamma: Any, rates: Rates, rule: str = "riemann") -> Laten
     return LatentGrid(system(link, gamma, rates), TIMES, GRID, rule)
 
 
-class DataSet(NamedTuple):
+@dataclass(frozen=True)
+class DataSet:
     """A simulated data set.
 
     Attributes:
