@@ -82,37 +82,37 @@ samplers = {
 }
 if quick:
     samplers = {name: {**settings, "thin": 1, "warmup": 50, "batch": 8} for name, settings in samplers.items()}
-found, seconds = {}, {}
+computed, seconds = {}, {}
 for label, model in (("linear", motif), ("softplus", softplus)):
     for sampler, settings in samplers.items():
         started = time.perf_counter()
         key = jax.random.key(12)
-        found[label, sampler] = calibration.calibrate(key, model, times, data_sets=data_sets, **settings)
+        computed[label, sampler] = calibration.calibrate(key, model, times, data_sets=data_sets, **settings)
         seconds[label, sampler] = time.perf_counter() - started
 
 # %% [markdown]
 # ### Linear, NUTS
 
 # %%
-plots.plot_calibration(found["linear", "NUTS"], width="full")
+plots.plot_calibration(computed["linear", "NUTS"], width="full")
 
 # %% [markdown]
 # ### Linear, RAM
 
 # %%
-plots.plot_calibration(found["linear", "RAM"], width="full")
+plots.plot_calibration(computed["linear", "RAM"], width="full")
 
 # %% [markdown]
 # ### Softplus, NUTS
 
 # %%
-plots.plot_calibration(found["softplus", "NUTS"], width="full")
+plots.plot_calibration(computed["softplus", "NUTS"], width="full")
 
 # %% [markdown]
 # ### Softplus, RAM
 
 # %%
-plots.plot_calibration(found["softplus", "RAM"], width="full")
+plots.plot_calibration(computed["softplus", "RAM"], width="full")
 
 # %% [markdown]
 # ## In numbers
@@ -123,7 +123,7 @@ plots.plot_calibration(found["softplus", "RAM"], width="full")
 
 # %%
 rows = []
-for (label, sampler), result in found.items():
+for (label, sampler), result in computed.items():
     for scalar, rank in result.ranks.items():
         p = calibration.p_values(rank, result.draws)
         rows.append({"model": label, "sampler": sampler, "scalar": scalar, **p})

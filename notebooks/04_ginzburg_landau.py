@@ -48,9 +48,9 @@ if quick:
     settings = settings.quick(realisations=1, conditional=2)
 # The folder of an earlier run of `lfm-ppl compare ginzburg-landau`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "double-well"))
-found = experiment.STUDY.run(settings, folder)
+result = experiment.STUDY.run(settings, folder)
 truth = problem.realisation(settings.figure, settings.seed)
-states, chains = (found.data[kind].isel(dataset=settings.figure) for kind in ("state", "mcmc"))
+states, chains = (result.data[kind].isel(dataset=settings.figure) for kind in ("state", "mcmc"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
 
 # %% [markdown]
@@ -80,17 +80,17 @@ figures.plot_marginals(truth, states)
 # known the truth should be well inside. For the EKF it is not.
 
 # %%
-figures.plot_conditional(found.data, settings.figure)
+figures.plot_conditional(result.data, settings.figure)
 
 # %% [markdown]
 # One path proves little. Over many paths: how often does the truth lie outside the central 99% interval? The nominal
 # rate is 1%.
 
 # %%
-figures.plot_rates(found.data)
+figures.plot_rates(result.data)
 
 # %%
-scores.readable(found.tables["rates"])
+scores.readable(result.tables["rates"])
 
 # %% [markdown]
 # `cut` is the share of posteriors that reach an end of the interval on which the prior is flat, `differs` the share of
@@ -106,7 +106,7 @@ scores.readable(found.tables["rates"])
 figures.plot_integrated(truth, chains)
 
 # %%
-scores.readable(found.tables["parameters"])
+scores.readable(result.tables["parameters"])
 
 # %% [markdown]
 # ## Everything in one table
@@ -117,4 +117,4 @@ scores.readable(found.tables["parameters"])
 # gives 0.895 (EKF) and 0.935 (CKF) as root mean squared errors of its one path with the parameters integrated out.
 
 # %%
-scores.readable(found.tables["comparison"])
+scores.readable(result.tables["comparison"])

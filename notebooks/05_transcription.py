@@ -53,7 +53,7 @@ if quick:
     settings = settings.quick(datasets=1, configurations=("exponential",))
 # The folder of an earlier run of `lfm-ppl compare transcription`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/transcription"))
-found = experiment.STUDY.run(settings, folder)
+computed = experiment.STUDY.run(settings, folder)
 
 # %% [markdown]
 # ## One data set, exponential response
@@ -63,7 +63,7 @@ found = experiment.STUDY.run(settings, folder)
 
 # %%
 exponential = problem.Configuration("exponential")
-figures.plot_force(found.data["exponential"], problem.data_set(exponential, 0, settings.seed))
+figures.plot_force(computed.data["exponential"], problem.data_set(exponential, 0, settings.seed))
 
 # %% [markdown]
 # ## All data sets beside the published table
@@ -80,7 +80,7 @@ figures.plot_force(found.data["exponential"], problem.data_set(exponential, 0, s
 # and GFS, which draw nothing.
 
 # %%
-scores.readable(found.tables["published"])
+scores.readable(computed.tables["published"])
 
 # %% [markdown]
 # ## Errors, coverage and time
@@ -89,16 +89,16 @@ scores.readable(found.tables["published"])
 # log predictive density of the force at a point; `CPU s` the time for one data set.
 
 # %%
-figures.plot_errors(found.data)
+figures.plot_errors(computed.data)
 
 # %%
-scores.readable(found.tables["comparison"])
+scores.readable(computed.tables["comparison"])
 
 # %% [markdown]
 # Against elliptical slice sampling, by pairs on the same data sets: an `RMSE ratio` of 1 is as good, below 1 better.
 
 # %%
-scores.readable(found.tables["paired"])
+scores.readable(computed.tables["paired"])
 
 # %% [markdown]
 # ## Full Bayes

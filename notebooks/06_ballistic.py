@@ -47,7 +47,7 @@ pd.set_option("display.width", 160, "display.max_columns", 30)
 settings = experiment.BallisticSettings.quick(runs=2) if quick else experiment.BallisticSettings()
 # The folder of an earlier run of `lfm-ppl compare ballistic`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/ballistic"))
-found = experiment.STUDY.run(settings, folder)
+result = experiment.STUDY.run(settings, folder)
 
 # %% [markdown]
 # ## One target
@@ -56,7 +56,7 @@ found = experiment.STUDY.run(settings, folder)
 # and those of the smoother with the most particles.
 
 # %%
-figures.plot_paths(found.data, settings.seed)
+figures.plot_paths(result.data, settings.seed)
 
 # %% [markdown]
 # ## All targets
@@ -67,10 +67,10 @@ figures.plot_paths(found.data, settings.seed)
 # know nothing of the parameters' uncertainty.
 
 # %%
-scores.readable(found.tables["tracking"])
+scores.readable(result.tables["tracking"])
 
 # %%
-figures.plot_coverage(found.data)
+figures.plot_coverage(result.data)
 
 # %% [markdown]
 # ## Particles
@@ -80,10 +80,10 @@ figures.plot_coverage(found.data)
 # time over its.
 
 # %%
-scores.readable(found.tables["particles"])
+scores.readable(result.tables["particles"])
 
 # %%
-figures.plot_particles(found.data)
+figures.plot_particles(result.data)
 
 # %% [markdown]
 # ## The drag
@@ -96,13 +96,13 @@ figures.plot_particles(found.data)
 # row has the force's scale and lengthscale known, and a flat prior of the drag alone.
 
 # %%
-figures.plot_drag(found.data)
+figures.plot_drag(result.data)
 
 # %%
-scores.readable(found.tables["parameters"])
+scores.readable(result.tables["parameters"])
 
 # %%
-scores.readable(found.tables["agreement"])
+scores.readable(result.tables["agreement"])
 
 # %% [markdown]
 # ## In three dimensions

@@ -67,11 +67,11 @@ else:
     settings = experiment.GpsSettings(data=str(shared) if real else None)
 # The folder of an earlier run of `lfm-ppl compare gps`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/gps"))
-found = experiment.STUDY.run(settings, folder)
-predicted, online = found.data["predict"], found.data.get("online")
-for reason in found.data["left out"].reason.values if "left out" in found.data else ():
+result = experiment.STUDY.run(settings, folder)
+predicted, online = result.data["predict"], result.data.get("online")
+for reason in result.data["left out"].reason.values if "left out" in result.data else ():
     print(f"left out, {reason}\n")
-scores.readable(found.tables["pooled"])
+scores.readable(result.tables["pooled"])
 
 # %% [markdown]
 # Errors are root mean squares of the distance in metres over the days that were predicted. *Deterministic* has an
@@ -82,14 +82,14 @@ scores.readable(found.tables["pooled"])
 figures.plot_all(predicted)
 
 # %%
-found.tables["satellites"][["eclipsed", "fit", "deterministic", "latest state", "LFM", "ratio", "coverage"]].round(3)
+result.tables["satellites"][["eclipsed", "fit", "deterministic", "latest state", "LFM", "ratio", "coverage"]].round(3)
 
 # %% [markdown]
 # What the satellites have in common: medians over them in nm/s² and hours, and the factor by which one differs from
 # another. The sunlight's force hardly oscillates; the other two do so mostly once a revolution.
 
 # %%
-found.tables["magnitudes"][["common", "factor"]].round(4)
+result.tables["magnitudes"][["common", "factor"]].round(4)
 
 # %% [markdown]
 # ## One satellite
@@ -124,4 +124,4 @@ figures.plot_online(online.sel(satellite=name)) if online is not None else None
 # what the source does.
 
 # %%
-scores.readable(found.tables["learning"]) if "learning" in found.tables else None
+scores.readable(result.tables["learning"]) if "learning" in result.tables else None

@@ -45,7 +45,7 @@ pd.set_option("display.width", 160, "display.max_columns", 30)
 settings = experiment.PeriodicKernelSettings.quick() if quick else experiment.PeriodicKernelSettings()
 # The folder of an earlier run of `lfm-ppl compare periodic-kernels`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/periodic-kernels"))
-found = experiment.STUDY.run(settings, folder)
+result = experiment.STUDY.run(settings, folder)
 
 # %% [markdown]
 # ## Eigenfunctions
@@ -64,10 +64,10 @@ figures.plot_eigenfunctions()
 # sparse spectrum) gain little from more of them.
 
 # %%
-figures.plot_errors(settings, found.data)
+figures.plot_errors(settings, result.data)
 
 # %%
-scores.readable(found.tables["covariance"])
+scores.readable(result.tables["covariance"])
 
 # %% [markdown]
 # `significant` counts eigenvalues above 1/100 of the largest, those of a pair together. That leaves out less than 0.01
@@ -82,7 +82,7 @@ scores.readable(found.tables["covariance"])
 figures.plot_covariances(settings)
 
 # %%
-scores.readable(found.tables["published"])
+scores.readable(result.tables["published"])
 
 # %% [markdown]
 # ## Predicting functions
@@ -93,10 +93,10 @@ scores.readable(found.tables["published"])
 # the variance of 1e-8 that is added to them; the order is that of its table 1.
 
 # %%
-figures.plot_prediction(settings, found.data)
+figures.plot_prediction(settings, result.data)
 
 # %%
-scores.readable(found.tables["regression"])
+scores.readable(result.tables["regression"])
 
 # %% [markdown]
 # ## Forces that nearly repeat

@@ -53,7 +53,7 @@ settings = experiment.CallCentreSettings.quick(days=1) if quick else experiment.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/call-centre"))
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", counts.OverloadWarning)
-    found = experiment.STUDY.run(settings, folder)
+    result = experiment.STUDY.run(settings, folder)
 first = problem.build_window(settings.data, settings.weekday, 0, settings.seed)
 print("real calls" if data else "simulated calls")
 
@@ -63,7 +63,7 @@ print("real calls" if data else "simulated calls")
 # Three days of training, then the test day. A force without a period (Matern) knows nothing of the next three hours.
 
 # %%
-figures.plot_queues(first, found.data, "constant")
+figures.plot_queues(first, result.data, "constant")
 
 # %% [markdown]
 # A model whose days are all alike (periodic) is far too sure of itself. RMSE over the day's 168 five minutes, and the
@@ -71,7 +71,7 @@ figures.plot_queues(first, found.data, "constant")
 # taken, so that only the order can be compared.
 
 # %%
-scores.readable(found.tables["constant"])
+scores.readable(result.tables["constant"])
 
 # %% [markdown]
 # ## A changed service rate
@@ -79,25 +79,25 @@ scores.readable(found.tables["constant"])
 # At $\Omega = 5$ in the afternoon the bank's calls exceed what is served for hours, and the queue grows to hundreds.
 
 # %%
-figures.plot_queues(first, found.data, "changed")
+figures.plot_queues(first, result.data, "changed")
 
 # %%
-scores.readable(found.tables["changed"])
+scores.readable(result.tables["changed"])
 
 # %% [markdown]
 # ## Arrivals
 
 # %%
-figures.plot_arrivals(first, found.data)
+figures.plot_arrivals(first, result.data)
 
 # %%
-figures.plot_cycles(first, found.data)
+figures.plot_cycles(first, result.data)
 
 # %% [markdown]
 # ## All test days
 
 # %%
-figures.plot_errors(found.data)
+figures.plot_errors(result.data)
 
 # %% [markdown]
 # ## Parameters integrated out
@@ -107,7 +107,7 @@ figures.plot_errors(found.data)
 # estimates a little better. The gain is in the log density of a day's queue.
 
 # %%
-scores.readable(found.tables["gain"])
+scores.readable(result.tables["gain"])
 
 # %% [markdown]
 # These are weighted draws about every mode of the posterior that searches from three starts find: `several modes` is
@@ -117,7 +117,7 @@ scores.readable(found.tables["gain"])
 # day.
 
 # %%
-scores.readable(found.tables["agreement"])
+scores.readable(result.tables["agreement"])
 
 # %%
-scores.readable(found.tables["learnt"])
+scores.readable(result.tables["learnt"])

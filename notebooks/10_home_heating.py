@@ -94,7 +94,7 @@ print("real house and simulated homes" if folder else f"no {problem.FILE}: simul
 make = experiment.HomeHeatingSettings.quick if quick else experiment.HomeHeatingSettings
 settings = make(data=None if folder is None else str(folder))
 kept = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/home-heating"))
-found = experiment.STUDY.run(settings, kept)
+result = experiment.STUDY.run(settings, kept)
 
 # %% [markdown]
 # ## The real house
@@ -107,9 +107,9 @@ found = experiment.STUDY.run(settings, kept)
 
 # %%
 def show(name, columns):
-    if name not in found.tables:
+    if name not in result.tables:
         return "no data"
-    table = scores.readable(found.tables[name])
+    table = scores.readable(result.tables[name])
     return table[[column for column in table.columns if any(part in column for part in columns)]]
 
 
@@ -137,7 +137,7 @@ show("house-envelope", ("below", "above"))
 # One of the days, with the heating power below:
 
 # %%
-figures.plot_house(settings, found.data) if settings.data else None
+figures.plot_house(settings, result.data) if settings.data else None
 
 # %% [markdown]
 # In all 29 windows CQM has an RMSE of 0.45 K (0.39 K with the walls), the Matern force 0.66 K (0.52 K), no residual
@@ -151,7 +151,7 @@ figures.plot_house(settings, found.data) if settings.data else None
 # The residual, day by day. What repeats is carried over to the fifth day; a Matern force forgets it within hours.
 
 # %%
-figures.plot_residual(found.data) if settings.data else None
+figures.plot_residual(result.data) if settings.data else None
 
 # %% [markdown]
 # ## Parameters integrated out
@@ -160,7 +160,7 @@ figures.plot_residual(found.data) if settings.data else None
 # by RAM and by NUTS, the prediction is a mixture over them:
 
 # %%
-scores.readable(found.tables["posterior"]) if "posterior" in found.tables else "no data"
+scores.readable(result.tables["posterior"]) if "posterior" in result.tables else "no data"
 
 # %% [markdown]
 # That is no gain here: on these days the bands at the most likely parameters hold nearly all measurements already, and
@@ -181,7 +181,7 @@ show("homes-one-store", ("RMSE ahead", "ELL ahead", "coverage"))
 show("homes-envelope", ("RMSE ahead", "ELL ahead", "coverage"))
 
 # %%
-figures.plot_homes(settings, found.data)
+figures.plot_homes(settings, result.data)
 
 # %%
-figures.plot_scores(found.data)
+figures.plot_scores(result.data)

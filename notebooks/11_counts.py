@@ -77,7 +77,7 @@ settings = experiment.CountsSettings.quick() if quick else experiment.CountsSett
     data=data, problems=(problem.COAL, *problem.SIMULATED))
 # The folder of an earlier run with these settings; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/counts"))
-found = experiment.STUDY.run(settings, folder)
+result = experiment.STUDY.run(settings, folder)
 print("real disasters" if data else "simulated disasters")
 
 # %% [markdown]
@@ -86,7 +86,7 @@ print("real disasters" if data else "simulated disasters")
 # The reference's median and 95% band are the dashed lines.
 
 # %%
-figures.plot_coal(settings, found.data)
+figures.plot_coal(settings, result.data)
 
 # %% [markdown]
 # ## The posterior of the predictor
@@ -97,7 +97,7 @@ figures.plot_coal(settings, found.data)
 # reference's own error is up to 0.03 in `mean` and `sd`, and 0.005 in log Z.
 
 # %%
-scores.readable(found.tables["accuracy"])
+scores.readable(result.tables["accuracy"])
 
 # %% [markdown]
 # Dotted: 0.2 in log Z, 0.05 posterior standard deviations, 3%. Laplace's method takes the mode for the mean, which is
@@ -107,7 +107,7 @@ scores.readable(found.tables["accuracy"])
 # Student's t are within 0.021 of the exact ones, those of yes or no within 0.040; means within 0.017 and 0.009 of one.
 
 # %%
-figures.plot_errors(settings, found.data)
+figures.plot_errors(settings, result.data)
 
 # %% [markdown]
 # ## Held-out data
@@ -117,7 +117,7 @@ figures.plot_errors(settings, found.data)
 # model of Student's t, which is why fewer than 95% of its data are covered.
 
 # %%
-scores.readable(found.tables["prediction"])
+scores.readable(result.tables["prediction"])
 
 # %% [markdown]
 # ## The parameters, and the reference itself
@@ -126,7 +126,7 @@ scores.readable(found.tables["prediction"])
 # effective share of the draws of importance sampling.
 
 # %%
-found.data["parameters"].to_dataframe().round(3)
+result.data["parameters"].to_dataframe().round(3)
 
 # %%
-found.data["comparison"].sel({"method": "reference"}, drop=True)[["ess", "r_hat", "share"]].to_dataframe().round(3)
+result.data["comparison"].sel({"method": "reference"}, drop=True)[["ess", "r_hat", "share"]].to_dataframe().round(3)

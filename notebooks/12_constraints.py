@@ -53,9 +53,9 @@ few = slice(0, 1501, 10)
 model = problem.transcription(scale=1.0, lengthscale=1.0)
 times, y, truth = problem.TIMES[few], record.y[few], record.force[few]
 smoothed = lfm.smooth(model, times, y).force("factor").mean
-found = lfm.full_information(model, times, y, lower={"factor": 0.0}, grid=times)
-pd.DataFrame({"least": [smoothed.min(), found.force("factor").min()],
-              "MSE": [np.mean((a - truth) ** 2) for a in (smoothed, found.force("factor"))]},
+computed = lfm.full_information(model, times, y, lower={"factor": 0.0}, grid=times)
+pd.DataFrame({"least": [smoothed.min(), computed.force("factor").min()],
+              "MSE": [np.mean((a - truth) ** 2) for a in (smoothed, computed.force("factor"))]},
              ["smoother", "full information"])
 
 # %% [markdown]

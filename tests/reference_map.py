@@ -24,9 +24,9 @@ def quadratic_program(mean, covariance, matrix, offset):
     solver = clarabel.DefaultSolver(
         sparse.csc_matrix(np.eye(size)), np.zeros(size), sparse.csc_matrix(-matrix @ root), matrix @ mean + offset,
         [clarabel.NonnegativeConeT(count)], settings)
-    found = solver.solve()
-    e = np.asarray(found.x)
-    return mean + root @ e, np.asarray(found.z), 0.5 * e @ e
+    result = solver.solve()
+    e = np.asarray(result.x)
+    return mean + root @ e, np.asarray(result.z), 0.5 * e @ e
 
 
 def matern_sde(scale, lengthscale, order):
@@ -136,11 +136,11 @@ class Transcribed:
             "print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-10,
             "ipopt.max_iter": 500})
         count = n * len(equal)
-        found = solver(x0=np.concatenate(start), lbg=np.zeros(conditions.shape[0]),
+        result = solver(x0=np.concatenate(start), lbg=np.zeros(conditions.shape[0]),
                        ubg=np.concatenate([np.zeros(count), np.full(len(low), np.inf)]))
         assert solver.stats()["success"], solver.stats()["return_status"]
-        values = np.asarray(found["x"]).ravel()[n: n * (len(times) + 1)].reshape(len(times), n)
-        return values * scale, float(found["f"])
+        values = np.asarray(result["x"]).ravel()[n: n * (len(times) + 1)].reshape(len(times), n)
+        return values * scale, float(result["f"])
 
 
 def _root(covariance):

@@ -39,29 +39,29 @@ PUBLIC = "lfm_ppl"  # the public API stands above the library and below the comm
 
 def modules() -> dict[str, Path]:
     """Return the library's modules, named below the package: ``forces.matern``."""
-    found = {}
+    result = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
         if parts[0] != "_models":
-            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    return found
+            result[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return result
 
 
 def imports(path: Path) -> list[tuple[int, str]]:
     """Return (line, module) of every import of lfm_ppl in a file, also inside functions."""
-    found = []
+    result = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            found += [(node.lineno, alias.name) for alias in node.names]
+            result += [(node.lineno, alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}:{node.lineno}: write imports from the root, lfm_ppl..."
             base = node.module or ""
             # `from lfm_ppl.inference import fit` may name a module or a member of the package.
-            found += [
+            result += [
                 (node.lineno, f"{base}.{a.name}" if is_module(f"{base}.{a.name}") else base)
                 for a in node.names
             ]
-    return [(line, name) for line, name in found if name.split(".")[0] == PUBLIC]
+    return [(line, name) for line, name in result if name.split(".")[0] == PUBLIC]
 
 
 def is_module(name: str) -> bool:
@@ -179,10 +179,10 @@ def test_a_model_and_its_filter_import_no_satellites_figures_or_experiments():
         "print(sorted(name for name in sys.modules if name.startswith('lfm_ppl.') and name.count('.') == 1), "
         "'matplotlib.pyplot' in sys.modules, 'arviz' in sys.modules)"
     )
-    found = run(code)
-    assert found.endswith("False False") and "lfm_ppl.filtering" in found
+    result = run(code)
+    assert result.endswith("False False") and "lfm_ppl.filtering" in result
     for part in ("orbits", "particles", "fokker_planck_grid", "results", "parallel", "experiments", "switching", "cli"):
-        assert f"lfm_ppl.{part}" not in found
+        assert f"lfm_ppl.{part}" not in result
 
 
 def test_names_imported_when_asked_for_are_ordinary_names():

@@ -36,12 +36,12 @@ def test_examples_beat_the_reference_as_the_page_says(name, output):
         pytest.skip(f"needs {FILES[name]}")
     run = subprocess.run([sys.executable, EXAMPLES / f"{name}.py", FILES[name]], cwd=ROOT, capture_output=True,
                          text=True, check=True)
-    found = numbers(run.stdout)
+    result = numbers(run.stdout)
     (shown,) = [block for block in re.findall(r"```text\n(.*?)```", (ROOT / "docs" / "forecasts.md").read_text("utf-8"),
                                               re.DOTALL) if f" {output} " in block]
     expected = numbers(shown)
-    assert found.keys() == expected.keys() and len(found) == 4
+    assert result.keys() == expected.keys() and len(result) == 4
     for label, row in expected.items():
-        assert found[label] == pytest.approx(row, abs=0.02), label
-    origins, rmse, _, log_score = found[output]
+        assert result[label] == pytest.approx(row, abs=0.02), label
+    origins, rmse, _, log_score = result[output]
     assert origins == 10 and rmse >= 8 and log_score >= 8

@@ -68,15 +68,15 @@ def test_local_links_and_included_files_exist():
 @functools.cache
 def literals() -> str:
     """Return all texts in the library's source, one a line, with a mark for what a message puts in."""
-    found = []
+    result = []
     for path in (ROOT / "lfm_ppl").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.JoinedStr):
                 parts = [part.value if isinstance(part, ast.Constant) else "\0" for part in node.values]
-                found.append("".join(map(str, parts)))
+                result.append("".join(map(str, parts)))
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                found.append(node.value)
-    return "\n".join(found)
+                result.append(node.value)
+    return "\n".join(result)
 
 
 def test_messages_are_found():

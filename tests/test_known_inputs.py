@@ -119,9 +119,9 @@ def test_dates_are_counted_in_the_model_s_unit_of_time_unless_the_user_says_anot
 
 def test_a_model_of_known_inputs_is_described_without_data():
     room = loading.load(str(pathlib.Path(__file__).parent.parent / "docs" / "examples" / "room.py"))
-    found = description.describe(room)
-    assert [parameter.name for parameter in found.parameters] == list(room.parameters)
-    assert found.forces == {"heat": "Matern (K/h)"} and found.approximation == "exact: the model is linear"
+    result = description.describe(room)
+    assert [parameter.name for parameter in result.parameters] == list(room.parameters)
+    assert result.forces == {"heat": "Matern (K/h)"} and result.approximation == "exact: the model is linear"
 
 
 @pytest.mark.parametrize(("changed", "message"), [

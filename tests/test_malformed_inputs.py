@@ -707,11 +707,11 @@ def test_what_is_wrong_is_one_line(name, there, capsys):
         put(there / path, content)
     before = contents(there)
     try:
-        found = main(shlex.split(line))
+        result = main(shlex.split(line))
     except SystemExit as exit_:
-        found = exit_.code
+        result = exit_.code
     said = capsys.readouterr().err
-    assert found == status, said
+    assert result == status, said
     if os.environ.get("SAY"):
         Path(os.environ["SAY"]).open("a").write(f"{name:45} {said}")
     assert said.startswith("lfm-ppl: ") and said.count("\n") == 1 and said.endswith("\n"), said

@@ -48,8 +48,8 @@ def test_models_are_found_wherever_the_package_is(installed, request, tmp_path):
     site = request.getfixturevalue("unpacked") if installed == "wheel" else ROOT
     folder = "lfm_ppl/_models" if installed == "wheel" else "models"
     code = "from lfm_ppl.io import loading; print(loading.load('spring').path)"
-    found = run([sys.executable, "-c", code], tmp_path, site)
-    assert Path(found.strip()) == (site / folder / "spring.py").resolve()
+    result = run([sys.executable, "-c", code], tmp_path, site)
+    assert Path(result.strip()) == (site / folder / "spring.py").resolve()
     listed = run([sys.executable, "-m", "lfm_ppl", "models"], tmp_path, site)
     assert all(name.removesuffix(".py").replace("_", "-") in listed for name in MODELS)
 

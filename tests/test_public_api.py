@@ -45,7 +45,7 @@ def test_the_random_key_comes_first(name):
 
 def test_every_method_that_samples_takes_the_key_first():
     """Also those of results, which are no public names of their own."""
-    found = set()
+    result = set()
     for module in pkgutil.walk_packages(lfm.__path__, "lfm_ppl."):
         if module.name.startswith(("lfm_ppl.experiments", "lfm_ppl.__main__")):
             continue
@@ -53,9 +53,9 @@ def test_every_method_that_samples_takes_the_key_first():
             if value.__module__ == module.name and "sample" in vars(value):
                 parameters = list(inspect.signature(value.sample).parameters)
                 if "key" in parameters:
-                    found.add(name)
+                    result.add(name)
                     assert parameters[1] == "key", f"{module.name}.{name}.sample"
-    assert {"SmootherResult", "MAPResult", "LaplaceResult", "MarginalLikelihood"} <= found
+    assert {"SmootherResult", "MAPResult", "LaplaceResult", "MarginalLikelihood"} <= result
 
 
 @pytest.mark.parametrize("call", [

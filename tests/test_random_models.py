@@ -75,19 +75,19 @@ def complaints(seed: int, count: int) -> list[str]:
     direction = {name: generator.normal(size=v.shape) * np.abs(v) for name, v in drawn.parameters.items()}
     along = sum((np.asarray(gradient[name]) * direction[name]).reshape(count, -1).sum(1) for name in direction)
     coarse, fine = (central_differences(with_data, drawn.parameters, direction, step) for step in (1e-6, 2.5e-7))
-    found = jax.jit(jax.vmap(partial(results, one, known_times)))(*drawn)
+    result = jax.jit(jax.vmap(partial(results, one, known_times)))(*drawn)
 
     said = []
     for index in range(count):
-        single = jax.tree_util.tree_map(lambda a: np.asarray(a)[index], found)  # noqa: B023
+        single = jax.tree_util.tree_map(lambda a: np.asarray(a)[index], result)  # noqa: B023
         slopes = along[index], coarse[index], fine[index]
         gradients = np.concatenate([np.asarray(g)[index].ravel() for g in gradient.values()])
         lines = _of_series(one, float(values[index]), gradients, slopes, single)
         said += [f"structure {seed}, series {index}: {line}" for line in lines]
-    return said + [f"structure {seed}: {line}" for line in _of_known_numbers(one, drawn, found)]
+    return said + [f"structure {seed}: {line}" for line in _of_known_numbers(one, drawn, result)]
 
 
-def _of_series(one: Structure, value: float, gradient: np.ndarray, slopes: tuple, found: dict) -> list[str]:
+def _of_series(one: Structure, value: float, gradient: np.ndarray, slopes: tuple, result: dict) -> list[str]:
     if not np.isfinite(gradient).all():
         return ["the gradient is not finite"]
     if value == -np.inf:
@@ -100,27 +100,27 @@ def _of_series(one: Structure, value: float, gradient: np.ndarray, slopes: tuple
         if not small <= most:
             said.append(f"{what}: {small:.1e}")
 
-    total = float(found["log likelihood"].sum())
+    total = float(result["log likelihood"].sum())
     expect(abs(value - total), 1e-6 * max(1.0, abs(total)), "distribution and filter")
-    expect(abs(found["in two windows"].sum() - total), 1e-6 * max(1.0, abs(total)), "in two windows and in one")
-    whole, windows = found["last means"]
+    expect(abs(result["in two windows"].sum() - total), 1e-6 * max(1.0, abs(total)), "in two windows and in one")
+    whole, windows = result["last means"]
     expect(np.max(np.abs(whole - windows) / np.maximum(1.0, np.abs(whole))), 1e-5, "last means")
 
     slope, coarse, fine = slopes
     scale = max(1.0, abs(slope))
-    if one.linear or np.sqrt(variances(found["predicted"]).max()) < RESOLVED:
+    if one.linear or np.sqrt(variances(result["predicted"]).max()) < RESOLVED:
         expect(abs(slope - fine) / scale, max(1e-3, 30 * abs(coarse - fine) / scale), "gradient and differences")
 
-    largest = variances(found["predicted"]).max(0)
+    largest = variances(result["predicted"]).max(0)
     for name in ("predicted", "filtered", "smoothed"):
-        expect(np.max(-variances(found[name]) - 1e-12 * largest), 0.0, f"negative variance, {name}")
+        expect(np.max(-variances(result[name]) - 1e-12 * largest), 0.0, f"negative variance, {name}")
     if one.linear:
-        filtered = variances(found["filtered"])
-        floor = np.maximum(1e-9 * variances(found["predicted"]), 1e-12)
-        excess = (variances(found["smoothed"]) - filtered) / np.maximum(filtered, floor)
+        filtered = variances(result["filtered"])
+        floor = np.maximum(1e-9 * variances(result["predicted"]), 1e-12)
+        excess = (variances(result["smoothed"]) - filtered) / np.maximum(filtered, floor)
         expect(excess.max(), 1e-6, "smoother above filter")
 
-    means, covariances = found["forecast means"], found["forecast covariances"]
+    means, covariances = result["forecast means"], result["forecast covariances"]
     sd = np.sqrt(np.maximum(variances(covariances[0]), 1e-16))
     expect(np.max(np.abs(means[0] - means[1]) / np.maximum(sd, 1e-6 * np.abs(means[0]))), 1e-4, "forecast means")
     expect(np.max(np.abs(covariances[0] - covariances[1]) / (sd[:, :, None] * sd[:, None, :])), 1e-4,
@@ -128,14 +128,14 @@ def _of_series(one: Structure, value: float, gradient: np.ndarray, slopes: tuple
     return said
 
 
-def _of_known_numbers(one: Structure, drawn: Series, found: dict) -> list[str]:
+def _of_known_numbers(one: Structure, drawn: Series, result: dict) -> list[str]:
     """The same outside of compiled code, where structure and time grid are read off the numbers."""
-    finite = np.flatnonzero(np.isfinite(np.asarray(found["log likelihood"])).all(1))
+    finite = np.flatnonzero(np.isfinite(np.asarray(result["log likelihood"])).all(1))
     if not finite.size:
         return []
     parameters, times, y = jax.tree_util.tree_map(lambda a: a[finite[0]], drawn)
     eager = lfm.filter(build(one, parameters), times, y, rule=one.rule, steps=one.steps).log_likelihood.sum()
-    difference = abs(float(eager) - float(found["log likelihood"][finite[0]].sum()))
+    difference = abs(float(eager) - float(result["log likelihood"][finite[0]].sum()))
     return [] if difference <= 1e-6 * max(1.0, abs(float(eager))) else [f"known numbers and traced: {difference:.1e}"]
 
 

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -146,7 +146,7 @@ class Division:
     max_step: float | None
     interval_per_step: bool
     is_adaptive: bool
-    breakpoints: np.ndarray = np.zeros(0)
+    breakpoints: np.ndarray = field(default_factory=lambda: np.zeros(0))
     traced_breakpoints: int = 0
     overhead: float = _OVERHEAD
     is_exact: bool = False

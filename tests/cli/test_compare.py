@@ -45,7 +45,7 @@ def wanted(monkeypatch):
             table = StudyTable("Rates", rates, rates)
             return StudyResult(settings, {}, {}, {"rates": table}, ("1 of 1 cell is consistent.",))
 
-        def save(self, found, folder):
+        def save(self, result, folder):
             return [folder / "rates.csv"]
 
     real = catalogue.CatalogueEntry.study.fget

@@ -38,15 +38,15 @@ def result(folder, tmp_path):
 
 
 def test_fit_until_and_at_stores_predictions_with_their_noise(folder):
-    found = arviz_data.group(arviz_data.load(folder / "result"), "predictions")
-    times = found["time"].values
+    result = arviz_data.group(arviz_data.load(folder / "result"), "predictions")
+    times = result["time"].values
     assert {0.0, 5.0, 6.25, 8.0} <= set(times.tolist())
-    assert found["y"].dims == ("chain", "draw", "time", "output")
-    np.testing.assert_allclose(found["y_sd"], np.hypot(0.3, found["outputs_sd"]))
-    assert (found["outputs_sd"].sel(time=2.0) > 0.05).all()  # of the smoother, given the parameters
-    assert (found["outputs_sd"].sel(time=[6.25, 8.0]) == 0).all()  # along each path, which is simulated there
-    assert found["y"].values[0, :, -1].std() > found["outputs"].values[0, :, -1].std() > 0.3
-    assert found.attrs["last_observation"] == 5.0
+    assert result["y"].dims == ("chain", "draw", "time", "output")
+    np.testing.assert_allclose(result["y_sd"], np.hypot(0.3, result["outputs_sd"]))
+    assert (result["outputs_sd"].sel(time=2.0) > 0.05).all()  # of the smoother, given the parameters
+    assert (result["outputs_sd"].sel(time=[6.25, 8.0]) == 0).all()  # along each path, which is simulated there
+    assert result["y"].values[0, :, -1].std() > result["outputs"].values[0, :, -1].std() > 0.3
+    assert result.attrs["last_observation"] == 5.0
 
 
 def test_forecast_of_a_stored_result_writes_table_figure_group_and_scores(result, tmp_path, capsys):

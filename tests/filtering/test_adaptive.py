@@ -63,9 +63,9 @@ def test_gradients_are_those_of_the_exact_integration_in_both_modes():
 def test_a_rejected_step_does_not_spoil_the_derivative():
     """A first step of an eighth of the interval would overflow."""
     at = jnp.array([-3.0, 40.0, 5.0])
-    found = jax.jit(jax.value_and_grad(lambda p: double_well(p, tolerance=1e-3, steps=1000).log_prob(Y)))(at)
-    assert np.isfinite(found[0])
-    assert np.isfinite(found[1]).all()
+    result = jax.jit(jax.value_and_grad(lambda p: double_well(p, tolerance=1e-3, steps=1000).log_prob(Y)))(at)
+    assert np.isfinite(result[0])
+    assert np.isfinite(result[1]).all()
 
 
 @pytest.mark.parametrize("start, link", [
@@ -78,8 +78,8 @@ def test_a_rejected_step_does_not_spoil_the_derivative():
 def test_driven_models(link, start):
     y = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]])
     exact = expression(start=start, link=link).log_prob(y)
-    found = expression(tolerance=1e-6, steps=60, start=start, link=link).log_prob(y)
-    np.testing.assert_allclose(found, exact, atol=2e-4)
+    result = expression(tolerance=1e-6, steps=60, start=start, link=link).log_prob(y)
+    np.testing.assert_allclose(result, exact, atol=2e-4)
 
 
 class Explicit(eqx.Module):
@@ -119,8 +119,8 @@ def test_dynamics_that_depend_on_time(keywords):
 
 def test_an_input_that_jumps_between_rows_takes_few_steps():
     """Its jump lies at an observation, between the end of one row and the start of the next."""
-    found = explicit(STEPPED, tolerance=1e-4, steps=20).log_prob(Y)
-    np.testing.assert_allclose(found, explicit(STEPPED).log_prob(Y), atol=1e-3)
+    result = explicit(STEPPED, tolerance=1e-4, steps=20).log_prob(Y)
+    np.testing.assert_allclose(result, explicit(STEPPED).log_prob(Y), atol=1e-3)
 
 
 @pytest.mark.slow
@@ -175,24 +175,24 @@ def test_a_cascade_from_a_known_zero_in_any_units(units):
 @pytest.mark.slow
 def test_smoothed_moments_at_requested_times():
     at = np.array([0.7, 5.1, 9.5])
-    exact, found = (lfm.smooth(double_well(SLOW_TO_STIFF[0]).model, TIMES, Y, at=at, **settings)
+    exact, result = (lfm.smooth(double_well(SLOW_TO_STIFF[0]).model, TIMES, Y, at=at, **settings)
                     for settings in ({"steps": 2000}, {"steps": 300, "tolerance": 1e-7}))
-    np.testing.assert_allclose(found.mean, exact.mean, atol=1e-4)
-    np.testing.assert_allclose(found.covariance, exact.covariance, atol=1e-4)
+    np.testing.assert_allclose(result.mean, exact.mean, atol=1e-4)
+    np.testing.assert_allclose(result.covariance, exact.covariance, atol=1e-4)
 
 
 @pytest.mark.slow
 def test_smoother_draws_and_requested_times():
     y = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]])
     at = np.array([0.0, 0.7, 2.0, 5.1, 9.5])
-    exact, found = expression().smooth(y, at=at), expression(tolerance=1e-7, steps=60).smooth(y, at=at)
-    np.testing.assert_allclose(found.mean, exact.mean, atol=1e-4)
-    np.testing.assert_allclose(found.covariance, exact.covariance, atol=1e-4)
-    np.testing.assert_allclose(found.leave_one_out, exact.leave_one_out, atol=1e-3)
-    draws = found.sample(jax.random.key(0), 4000)
-    sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    exact, result = expression().smooth(y, at=at), expression(tolerance=1e-7, steps=60).smooth(y, at=at)
+    np.testing.assert_allclose(result.mean, exact.mean, atol=1e-4)
+    np.testing.assert_allclose(result.covariance, exact.covariance, atol=1e-4)
+    np.testing.assert_allclose(result.leave_one_out, exact.leave_one_out, atol=1e-3)
+    draws = result.sample(jax.random.key(0), 4000)
+    sd = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
     np.testing.assert_allclose(draws.state.std(0)[1:], sd[1:, :2], rtol=0.05)
-    np.testing.assert_allclose(draws.forces["u"].std(0), found.force("u").sd, rtol=0.05)
+    np.testing.assert_allclose(draws.forces["u"].std(0), result.force("u").sd, rtol=0.05)
 
 
 @pytest.mark.slow

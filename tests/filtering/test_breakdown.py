@@ -26,8 +26,8 @@ def test_the_row_and_the_step_are_named():
     steep = double_well(b=5.0)
     with pytest.warns(lfm.FilterWarning, match=r"row 2 \(time 9\), step \d of 10 from time 1 to 9: the predicted "
                                                r"(mean|covariance) is not finite.*-inf.*steps=.*max_step="):
-        found = lfm.filter(steep, TIMES, Y, **LONG_STEPS)
-    assert not np.isfinite(found.log_likelihood[2])
+        result = lfm.filter(steep, TIMES, Y, **LONG_STEPS)
+    assert not np.isfinite(result.log_likelihood[2])
     with pytest.warns(lfm.FilterWarning, match=r"row 2 \(time 9\)"):
         lfm.smooth(steep, TIMES, Y, **LONG_STEPS)
     with warnings.catch_warnings():
@@ -69,8 +69,8 @@ def test_compiled_code_says_nothing():
     y = jnp.asarray(Y)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = jax.jit(lambda b: lfm.filter(double_well(b=b), TIMES, y, **LONG_STEPS).log_likelihood)(5.0)
-    assert not np.isfinite(found).all()
+        result = jax.jit(lambda b: lfm.filter(double_well(b=b), TIMES, y, **LONG_STEPS).log_likelihood)(5.0)
+    assert not np.isfinite(result).all()
 
 
 def test_nothing_is_said_where_nothing_breaks_down():
@@ -112,10 +112,10 @@ def test_what_grows_beyond_all_digits_is_impossible_or_right():
         times = np.array([0.5, gap, gap, gap + 0.01, gap + 1.0])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", lfm.FilterWarning)
-            found = float(lfm.filter(unstable(1e-4), times, y).log_likelihood.sum())
-        impossible.append(found == -np.inf)
+            result = float(lfm.filter(unstable(1e-4), times, y).log_likelihood.sum())
+        impossible.append(result == -np.inf)
         if not impossible[-1]:
-            assert found == pytest.approx(exact_log_likelihood(times, y, 1e-4), rel=1e-5), gap
+            assert result == pytest.approx(exact_log_likelihood(times, y, 1e-4), rel=1e-5), gap
     assert impossible == [False] * 4 + [True] * 4
 
 
@@ -152,5 +152,5 @@ def test_small_observations_next_to_a_wide_prior_are_no_failure(noise, variance,
         dynamics, {"u": lfm.Matern(1.0, 1.0, order=2)},
         lfm.GaussianObservation(Outputs(jnp.array([[1.0, 0.7, 0.0, 0.0]])), noise * jnp.ones(1)),
         lfm.Gaussian(jnp.zeros(3), variance * jnp.eye(3)))
-    found = lfm.filter(model, np.linspace(0.0, 3.0, 5), np.full((5, 1), y))
-    assert np.isfinite(found.log_likelihood).all()
+    result = lfm.filter(model, np.linspace(0.0, 3.0, 5), np.full((5, 1), y))
+    assert np.isfinite(result.log_likelihood).all()

@@ -78,19 +78,19 @@ def test_the_force_keeps_its_stationary_distribution(link, steps):
     """Nothing is learnt from the observation of an output that the force does not reach."""
     model = motif(link, order=2)
     model = eqx.tree_at(lambda m: m.dynamics.sensitivity, model, jnp.zeros(2))
-    found = lfm.smooth(model, [0.3, 1.0, 50.0], np.ones((3, 2)), steps=steps, at=[0.1, 0.9, 50.0, 2000.0])
+    result = lfm.smooth(model, [0.3, 1.0, 50.0], np.ones((3, 2)), steps=steps, at=[0.1, 0.9, 50.0, 2000.0])
     stationary = np.asarray(lfm.Matern(1.0, 1.3, 2).initial_covariance())
-    assert np.abs(found.covariance[:, 2:, 2:] - stationary).max() < 1e-10
-    assert np.abs(found.mean[:, 2:]).max() < 1e-10
+    assert np.abs(result.covariance[:, 2:, 2:] - stationary).max() < 1e-10
+    assert np.abs(result.mean[:, 2:]).max() < 1e-10
 
 
 def test_stationary_in_prediction():
     """Predicted moments before the first observation: exact for the force's block, also when it drives x."""
     model = motif(softplus, order=1)
     for length in (1e-9, 0.3, 10.0, 1300.0):
-        found = lfm.filter(model, [length], [[0.3, 0.2]], steps=1)
+        result = lfm.filter(model, [length], [[0.3, 0.2]], steps=1)
         stationary = np.asarray(lfm.Matern(1.0, 1.3, 1).initial_covariance())
-        assert np.abs(found.predicted_covariance[0, 2:, 2:] - stationary).max() < 1e-10
+        assert np.abs(result.predicted_covariance[0, 2:, 2:] - stationary).max() < 1e-10
 
 
 def test_a_gap_of_a_thousand_lengthscales():
@@ -106,8 +106,8 @@ def test_a_gap_of_a_thousand_lengthscales():
         return Regression(process, np.eye(1, 2), np.array([0.01])).log_likelihood(times[part], y[part])
 
     expected = dense(0.0, np.ones(1), slice(0, 2)) + dense(1251.0, np.zeros(1), slice(2, 4))
-    found = lfm.filter(model, times, y).log_likelihood.sum()
-    assert abs(found - expected) < 1e-8 * abs(expected)
+    result = lfm.filter(model, times, y).log_likelihood.sum()
+    assert abs(result - expected) < 1e-8 * abs(expected)
     for build in (motif(genes=1, order=0), motif(genes=1, order=2, variance=1.0), double_well()):
         coarse = lfm.filter(build, [0.5, 1.0, 1301.0, 1301.5] if build.forces else [0.1, 0.2, 1.0, 1.2], y)
         assert np.isfinite(coarse.log_likelihood).all()
@@ -116,8 +116,8 @@ def test_a_gap_of_a_thousand_lengthscales():
 @pytest.mark.parametrize("variance", [0.0, 1e-300, 1e-30])
 def test_known_initial_state(variance):
     """A known state moves on as if its variance were tiny."""
-    found = lfm.filter(motif(variance=variance), [0.0, 0.0, 0.4], np.array([[0.4, 0.25]] * 3))
+    result = lfm.filter(motif(variance=variance), [0.0, 0.0, 0.4], np.array([[0.4, 0.25]] * 3))
     nearby = lfm.filter(motif(variance=1e-16), [0.0, 0.0, 0.4], np.array([[0.4, 0.25]] * 3))
-    for a, b in zip(jax.tree_util.tree_leaves(found), jax.tree_util.tree_leaves(nearby), strict=True):
+    for a, b in zip(jax.tree_util.tree_leaves(result), jax.tree_util.tree_leaves(nearby), strict=True):
         assert np.isfinite(a).all()
         assert np.allclose(a, b, rtol=1e-8, atol=1e-12)

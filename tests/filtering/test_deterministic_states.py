@@ -131,8 +131,8 @@ def test_cases_of_a_deterministic_equation():
     for model, y, expected, error in (
             (linear, counts, counted, 1e-12), (curved, counts, counted, 1e-6),
             (limit, 10 * np.exp(-0.3 * TIMES)[:, None] + 0.1, 6 * scipy.stats.norm.logpdf(0.1, 0.0, 0.3), 1e-12)):
-        found = without_warnings(lambda model=model, y=y: lfm.MarginalLikelihood(model, TIMES).log_prob(y))
-        assert float(found) == pytest.approx(expected, rel=error)
+        result = without_warnings(lambda model=model, y=y: lfm.MarginalLikelihood(model, TIMES).log_prob(y))
+        assert float(result) == pytest.approx(expected, rel=error)
 
 
 VARIANCES = [0.0, 1e-300, 1e-110, 1e-60, 1e-32, 1e-29, 1e-26, 1e-22, 1e-18, 1e-14, 1e-12, 1e-10]
@@ -195,9 +195,9 @@ def test_deterministic_and_uncertain_outputs_side_by_side():
         return jnp.where(np.isnan(y[:, 0]), 0.0, jnp.nan_to_num(y[:, 0]) * f - jnp.exp(f)
                          - gammaln(jnp.nan_to_num(y[:, 0]) + 1.0))
 
-    found = jax.jit(jax.value_and_grad(lambda theta: both(theta).log_prob(y)))(theta)
+    result = jax.jit(jax.value_and_grad(lambda theta: both(theta).log_prob(y)))(theta)
     parts = jax.jit(jax.value_and_grad(lambda theta: alone(theta).log_prob(y[:, 1:]) + counted(theta).sum()))(theta)
-    for value, expected in zip(found, parts, strict=True):
+    for value, expected in zip(result, parts, strict=True):
         np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-9)
     smoothed, of_force = both(theta).smooth(y), alone(theta).smooth(y[:, 1:])
     np.testing.assert_allclose(smoothed.leave_one_out, of_force.leave_one_out + counted(theta), rtol=1e-9, atol=1e-9)
@@ -219,11 +219,11 @@ def test_a_conserved_sum_of_uncertain_states_is_deterministic():
         return lfm.MarginalLikelihood(model, TIMES)
 
     y = np.stack([0.23 + 0.1 * np.sin(3.0 * TIMES), np.cos(TIMES)], axis=1)
-    found = jax.jit(jax.value_and_grad(lambda theta: log_prob(theta).log_prob(y)))(theta)
+    result = jax.jit(jax.value_and_grad(lambda theta: log_prob(theta).log_prob(y)))(theta)
     only = np.where([True, False], np.nan, y)
     parts = jax.jit(jax.value_and_grad(lambda theta: log_prob(theta).log_prob(only) + stats.t.logpdf(
         y[:, 0], 4.0, (1.3 + theta[1]) / 7.0, 0.1).sum()))(theta)
-    for value, expected in zip(found, parts, strict=True):
+    for value, expected in zip(result, parts, strict=True):
         np.testing.assert_allclose(value, expected, rtol=1e-9)
 
 

@@ -84,13 +84,13 @@ def test_where_a_filter_may_start():
 
 
 def test_names_of_a_result():
-    found = lfm.smooth(motif(genes=1), TIMES, Y)
+    result = lfm.smooth(motif(genes=1), TIMES, Y)
     with pytest.raises(ValueError, match="unknown force 'v'.*Known: u"):
-        found.force("v")
+        result.force("v")
     with pytest.raises(ValueError, match="unknown state 'x1'. Did you mean 'x0'"):
-        found.state("x1")
+        result.state("x1")
     with pytest.raises(ValueError, match="draws must be at least 1, got 0"):
-        found.sample(jax.random.key(0), 0)
+        result.sample(jax.random.key(0), 0)
 
 
 def test_the_prior_mean_must_give_finite_values():
@@ -113,9 +113,9 @@ def test_traced_times_cannot_be_cut():
 
 def test_nothing_raises_inside_compiled_code():
     """Values that would be refused outside give a number inside."""
-    found = jax.jit(lambda noise: lfm.MarginalLikelihood(
+    result = jax.jit(lambda noise: lfm.MarginalLikelihood(
         motif(genes=1, noise_sd=noise, variance=0.1), TIMES).log_prob(Y))(jnp.nan)
-    assert found == -np.inf
+    assert result == -np.inf
 
 
 def test_single_precision_warns_once(monkeypatch):

@@ -123,8 +123,8 @@ def test_blow_up_is_minus_infinity_with_zero_gradient(compiled, name, theta, reg
     value, gradient = compiled(name)
     theta = jnp.array(theta)
     assert value(theta, jnp.asarray(Y)) == -np.inf
-    for found in gradient(theta, jnp.asarray(Y)):
-        assert np.array_equal(found, np.zeros(len(theta)))
+    for result in gradient(theta, jnp.asarray(Y)):
+        assert np.array_equal(result, np.zeros(len(theta)))
     both = jnp.stack([theta, jnp.array(regular)])
     values, gradients = jax.jit(jax.vmap(jax.value_and_grad(lambda p: value(p, jnp.asarray(Y)))))(both)
     assert np.isneginf(values[0]) and np.isfinite(values[1])

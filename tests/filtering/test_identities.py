@@ -39,9 +39,9 @@ def test_cubature_is_an_unscented_transform():
     oscillator = lfm.LatentForceModel(
         Oscillator(1.0, 0.5, 0.7), {"u": lfm.Matern(1.0, 1.0, 0)}, lfm.GaussianObservation(first_state, jnp.ones(1)),
         lfm.Gaussian(jnp.ones(2), 0.2 * jnp.eye(2)))
-    found = [lfm.filter(oscillator, TIMES, Y[:, :1], rule=rule, steps=3)
+    result = [lfm.filter(oscillator, TIMES, Y[:, :1], rule=rule, steps=3)
              for rule in (lfm.Cubature(), lfm.Unscented(1.0, 0.0, 0.0))]
-    same(moments_of(found[0]), moments_of(found[1]), 1e-12)
+    same(moments_of(result[0]), moments_of(result[1]), 1e-12)
 
 
 class Polynomial(eqx.Module):
@@ -62,9 +62,9 @@ def test_projected_points_equal_points_in_the_whole_state_within_their_degree(dy
     model = lfm.LatentForceModel(
         dynamics, {"u": lfm.Matern(0.7, 1.0, 0)}, lfm.GaussianObservation(whole_state, 0.1 * jnp.ones(2)),
         lfm.Gaussian(jnp.array([0.5, 0.2]), 0.05 * jnp.eye(2)))
-    found = [lfm.filter(model, TIMES, Y, rule=lfm.GaussHermite(3, full_state=full), steps=2)
+    result = [lfm.filter(model, TIMES, Y, rule=lfm.GaussHermite(3, full_state=full), steps=2)
              for full in (False, True)]
-    same(moments_of(found[0]), moments_of(found[1]), 1e-10)
+    same(moments_of(result[0]), moments_of(result[1]), 1e-10)
 
 
 @pytest.mark.slow
@@ -203,10 +203,10 @@ def test_the_model_may_depend_on_parameters_that_are_traced(model):
 
 
 def test_traced_times(model):
-    found = jax.jit(lambda t: lfm.filter(model, t, Y).log_likelihood)(jnp.asarray(TIMES))
+    result = jax.jit(lambda t: lfm.filter(model, t, Y).log_likelihood)(jnp.asarray(TIMES))
     start = lfm.LatentForceModel(model.dynamics, model.forces, model.observation, model.initial_state,
                                  initial_time=0.0)
-    same(found, lfm.filter(start, TIMES, Y).log_likelihood, 1e-10)
+    same(result, lfm.filter(start, TIMES, Y).log_likelihood, 1e-10)
 
 
 def test_more_interval_lengths_than_are_tabulated():

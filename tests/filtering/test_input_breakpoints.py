@@ -55,8 +55,8 @@ def exposed(starts, widths, amounts, t, lag=0.0):
 def test_pulse_trains_of_a_linear_model(keywords):
     for seed in range(3):
         train = pulses(seed)
-        found = means(system(table(*train)), ROWS, **keywords)
-        np.testing.assert_allclose(found, exposed(*train, ROWS), rtol=1e-8, atol=1e-9)
+        result = means(system(table(*train)), ROWS, **keywords)
+        np.testing.assert_allclose(result, exposed(*train, ROWS), rtol=1e-8, atol=1e-9)
 
 
 @pytest.mark.parametrize("keywords", [{}, {"tolerance": 1e-2, "steps": 40}], ids=str)
@@ -72,8 +72,8 @@ def test_pulse_trains_of_saturable_elimination(keywords):
         x = solve_ivp(lambda s, x, flow=flow, length=length: length * (flow - elimination(x)), (0.0, 1.0), x,
                       method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
         expected[end] = x[0]
-    found = means(system(rate, elimination), ROWS, **keywords)
-    np.testing.assert_allclose(found, [expected[t] for t in ROWS], rtol=1e-4, atol=1e-5)
+    result = means(system(rate, elimination), ROWS, **keywords)
+    np.testing.assert_allclose(result, [expected[t] for t in ROWS], rtol=1e-4, atol=1e-5)
 
 
 def test_narrow_pulses_at_unix_times():
@@ -81,8 +81,8 @@ def test_narrow_pulses_at_unix_times():
     starts, origin = np.arange(0.25, 12.0, 1.5), 1.7e9
     widths = np.full(len(starts), 2.0**-20)
     train = starts, widths, np.ones(len(starts))
-    found = means(system(table(*train, origin=origin), initial_time=origin), origin + ROWS)
-    np.testing.assert_allclose(found, exposed(*train, ROWS), rtol=1e-6, atol=1e-9)
+    result = means(system(table(*train, origin=origin), initial_time=origin), origin + ROWS)
+    np.testing.assert_allclose(result, exposed(*train, ROWS), rtol=1e-6, atol=1e-9)
 
 
 def test_an_offset_that_is_a_number_moves_the_jumps():
@@ -92,19 +92,19 @@ def test_an_offset_that_is_a_number_moves_the_jumps():
     starts, ends = ((edge + 1.7e9) - 1.7e9 for edge in (starts, starts + np.maximum(widths, 1e-5)))
     train = starts, ends - starts, amounts
     rate = table(*train, origin=1.7e9)
-    found = means(system(lambda t: rate(t + 1.7e9)), ROWS)
-    np.testing.assert_allclose(found, exposed(*train, ROWS), rtol=1e-8, atol=1e-9)
+    result = means(system(lambda t: rate(t + 1.7e9)), ROWS)
+    np.testing.assert_allclose(result, exposed(*train, ROWS), rtol=1e-8, atol=1e-9)
 
 
 def test_kinks_of_a_linear_input():
     """A triangle between two rows, in a model that is exact but for its input."""
     ramp = lfm.Input([-9.0, 2.3, 2.5, 2.8, 99.0], [0.0, 0.0, 4.0, 0.0, 0.0], "linear", "hold")
-    found = means(system(ramp), ROWS)
+    result = means(system(ramp), ROWS)
     corner = lambda edge, t: np.where(t > edge, (t - edge) / DECAY + np.expm1(-DECAY * np.clip(t - edge, 0, None))  # noqa: E731
                                       / DECAY**2, 0.0)
     slopes = np.array([20.0, -20.0 - 4 / 0.3, 4 / 0.3])
     expected = sum(a * corner(edge, ROWS) for a, edge in zip(slopes, (2.3, 2.5, 2.8), strict=True))
-    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(result, expected, rtol=1e-7, atol=1e-8)
 
 
 def test_only_true_jumps_and_kinks_divide_an_interval():
@@ -147,9 +147,9 @@ LAGS = np.array([0.31, 1.2, 1.37, 1.43, 2.0 - 1e-9, 2.0 + 1e-9, 3.7])
 def test_value_and_derivative_with_respect_to_a_lag(keywords):
     value, gradient = jax.jit(jax.vmap(jax.value_and_grad(lambda lag: lagged(lag, **keywords))))(LAGS)
     np.testing.assert_allclose(value, [closed_form(lag) for lag in LAGS], rtol=1e-7)
-    for lag, found in zip(LAGS, gradient, strict=True):
+    for lag, result in zip(LAGS, gradient, strict=True):
         side = 1e-5 * np.sign(lag - 2.0) if abs(lag - 2.0) < 1e-6 else 0.0
-        np.testing.assert_allclose(found, slope(closed_form, lag + side), rtol=2e-3 if side else 1e-4)
+        np.testing.assert_allclose(result, slope(closed_form, lag + side), rtol=2e-3 if side else 1e-4)
 
 
 def test_two_lags_and_a_lag_that_is_a_number():
@@ -187,8 +187,8 @@ def test_smoothing_at_requested_times_with_a_traced_lag():
     at = np.linspace(0.0, 14.0, 9)
     run = lambda lag: tuple(getattr(lfm.smooth(forced(lag), ROWS, Y[:, None], at=at), name)  # noqa: E731
                             for name in ("mean", "covariance"))
-    for found, expected in zip(jax.jit(run)(1.37), run(1.37), strict=True):
-        np.testing.assert_allclose(found, expected, atol=2e-3)
+    for result, expected in zip(jax.jit(run)(1.37), run(1.37), strict=True):
+        np.testing.assert_allclose(result, expected, atol=2e-3)
 
 
 def test_a_time_that_bends_with_a_parameter_is_refused():
@@ -207,8 +207,8 @@ def test_simulations_and_particles_do_not_step_over_pulses():
     noisy = lfm.LatentForceModel(
         model.dynamics, {}, model.observation, lfm.Gaussian(jnp.zeros(1), 1e-16 * jnp.eye(1)),
         process_noise=lambda x, u, t: 1e-8 * (1.0 + jnp.tanh(x) ** 2)[:, None], initial_time=0.0)
-    found = lfm.particle_filter(jax.random.key(0), noisy, ROWS, Y[:, None], particles=4, steps=200)
-    np.testing.assert_allclose(found.mean[:, 0], exposed(*train, ROWS), rtol=2e-2, atol=1e-2)
+    result = lfm.particle_filter(jax.random.key(0), noisy, ROWS, Y[:, None], particles=4, steps=200)
+    np.testing.assert_allclose(result.mean[:, 0], exposed(*train, ROWS), rtol=2e-2, atol=1e-2)
 
 
 @pytest.mark.parametrize("keywords", [{}, {"tolerance": 1e-3}, {"steps": 100}, {"max_step": 0.5}], ids=str)
@@ -219,10 +219,10 @@ def test_doses_between_sparse_samples(keywords):
     rate = lfm.Input(np.ravel([starts, starts + width], "F"), np.ravel([amounts / width, 0 * amounts], "F"),
                      "previous", "hold")
     rows = np.array([2.0, 112.5])
-    found = means(system(lambda t: rate(t) / volume, lambda x: decay * x), rows, **keywords)
+    result = means(system(lambda t: rate(t) / volume, lambda x: decay * x), rows, **keywords)
     exact = [sum(a / width / volume / decay * -np.expm1(-decay * width) * np.exp(-decay * (t - s - width))
                  for s, a in zip(starts, amounts, strict=True) if s < t) for t in rows]
-    np.testing.assert_allclose(found, exact, rtol=1e-9)
+    np.testing.assert_allclose(result, exact, rtol=1e-9)
 
 
 def test_a_lag_is_learnt():

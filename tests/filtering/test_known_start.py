@@ -32,10 +32,10 @@ def test_between_nodes_it_is_the_exact_smoother(variance):
     """A linear model by its exact transition and in Runge-Kutta steps, from a known start to an unknown one."""
     y = np.asarray(lfm.simulate(jax.random.key(0), genes(lambda u: u), TIMES).y)
     exact = lfm.smooth(genes(lambda u: u, variance), TIMES, y, at=AT)
-    found = lfm.smooth(genes(lambda u: u, variance, integrated=True), TIMES, y, at=AT)
+    result = lfm.smooth(genes(lambda u: u, variance, integrated=True), TIMES, y, at=AT)
     scale = np.sqrt(np.diagonal(np.asarray(exact.covariance), axis1=1, axis2=2).max(axis=0))
-    assert np.all(np.abs(found.mean - exact.mean) < 2e-4 * scale)
-    assert np.all(np.abs(found.covariance - exact.covariance) < 2e-4 * scale * scale[:, None])
+    assert np.all(np.abs(result.mean - exact.mean) < 2e-4 * scale)
+    assert np.all(np.abs(result.covariance - exact.covariance) < 2e-4 * scale * scale[:, None])
 
 
 @pytest.mark.parametrize("iterations", [0, pytest.param(25, marks=pytest.mark.slow)])
@@ -43,11 +43,11 @@ def test_variances_are_positive_and_below_the_prior(iterations):
     """Also after iterations, which converge to the last digits."""
     model = genes(lambda u: jax.nn.sigmoid(jnp.log(0.1) - u) / 0.1)
     y = np.asarray(lfm.simulate(jax.random.key(1), model, TIMES).y)
-    found = lfm.smooth(model, TIMES, y, lfm.GaussHermite(7), 10, at=AT, iterations=iterations, damping=0.5)
-    force = found.covariance[:, 3:, 3:]
-    assert np.all(np.asarray(found.force("u").sd) > 0.02)
+    result = lfm.smooth(model, TIMES, y, lfm.GaussHermite(7), 10, at=AT, iterations=iterations, damping=0.5)
+    force = result.covariance[:, 3:, 3:]
+    assert np.all(np.asarray(result.force("u").sd) > 0.02)
     assert np.linalg.eigvalsh(np.asarray(force)).min() > 0
-    assert np.linalg.eigvalsh(np.asarray(found.covariance)).min() > -1e-12
+    assert np.linalg.eigvalsh(np.asarray(result.covariance)).min() > -1e-12
     prior = np.diagonal(np.asarray(state_space(model).initial()[1]))[3:]  # of a stationary force, at all times
     assert np.all(np.diagonal(np.asarray(force), axis1=1, axis2=2) <= prior * (1 + 1e-6))
-    assert iterations == 0 or found.change < 1e-3
+    assert iterations == 0 or result.change < 1e-3

@@ -151,11 +151,11 @@ def smoothed(case):
     return lfm.smooth(case.model, case.times, case.y, steps=case.steps, at=AT)
 
 
-def close(found, expected, tolerance=1e-8):
+def close(result, expected, tolerance=1e-8):
     """Relative to the largest entry."""
-    found, expected = np.asarray(found), np.asarray(expected)
-    assert found.shape == expected.shape
-    assert np.abs(found - expected).max() <= tolerance * np.abs(expected).max()
+    result, expected = np.asarray(result), np.asarray(expected)
+    assert result.shape == expected.shape
+    assert np.abs(result - expected).max() <= tolerance * np.abs(expected).max()
 
 
 def test_log_likelihood(case, smoothed):
@@ -178,19 +178,19 @@ def test_leave_one_out(case, smoothed):
                                   "mean function"])
 def test_filter(name):
     case = CASES[name]()
-    found = lfm.filter(case.model, case.times, case.y, steps=case.steps)
+    result = lfm.filter(case.model, case.times, case.y, steps=case.steps)
     mean, covariance = case.reference.filtered(case.times, case.y)
     ssm = lfm.state_space(case.model)
     matrix, offset = jax.vmap(ssm.input_map)(jnp.asarray(case.times))
-    close(jnp.einsum("kwn,kn->kw", matrix, found.filtered_mean) + offset, mean)
-    close(jnp.einsum("kwn,knm,kvm->kwv", matrix, found.filtered_covariance, matrix), covariance)
-    close(found.log_likelihood.sum(), case.reference.log_likelihood(case.times, case.y))
+    close(jnp.einsum("kwn,kn->kw", matrix, result.filtered_mean) + offset, mean)
+    close(jnp.einsum("kwn,knm,kvm->kwv", matrix, result.filtered_covariance, matrix), covariance)
+    close(result.log_likelihood.sum(), case.reference.log_likelihood(case.times, case.y))
     present = np.isfinite(case.y)
     # Whitened residuals are another way to write the same quadratic form.
-    assert np.array_equal(np.isfinite(found.whitened_innovation), present)
+    assert np.array_equal(np.isfinite(result.whitened_innovation), present)
     whole = case.reference.joint(case.times, case.y)
     residual, k = whole[1][present.ravel()], whole[2][np.ix_(present.ravel(), present.ravel())]
-    close(np.nansum(np.asarray(found.whitened_innovation) ** 2), residual @ np.linalg.solve(k, residual))
+    close(np.nansum(np.asarray(result.whitened_innovation) ** 2), residual @ np.linalg.solve(k, residual))
 
 
 def test_initial_time_defaults_to_the_first_observation():

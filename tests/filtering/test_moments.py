@@ -38,8 +38,8 @@ OBSERVATION = np.r_[np.full(ROWS - 1, np.nan), 0.8][:, None]
 
 
 def predicted(model, rule, count):
-    found = lfm.filter(model, padded(count, END, ROWS), OBSERVATION, rule=rule, steps=1)
-    return np.append(found.predicted_mean[-1], found.predicted_covariance[-1].ravel())
+    result = lfm.filter(model, padded(count, END, ROWS), OBSERVATION, rule=rule, steps=1)
+    return np.append(result.predicted_mean[-1], result.predicted_covariance[-1].ravel())
 
 
 @pytest.mark.parametrize("name", RULES)
@@ -62,8 +62,8 @@ def test_steps_are_rows():
     """The same steps inside one row, where the smoother asks for the flow too."""
     model = double_well()
     many = predicted(model, lfm.Cubature(), 10)
-    found = lfm.filter(model, [END], [[0.8]], steps=10)
-    one = np.append(found.predicted_mean, found.predicted_covariance)
+    result = lfm.filter(model, [END], [[0.8]], steps=10)
+    one = np.append(result.predicted_mean, result.predicted_covariance)
     assert np.abs(many - one).max() < 1e-13
 
 
@@ -113,9 +113,9 @@ def test_pendulum_with_force_and_state_dependent_noise(name, rule, points):
                                joint_jacobian)
     errors = []
     for count in (20, 40, 100):
-        found = lfm.filter(model, padded(count, END, ROWS), y, rule=rule, steps=1)
-        errors.append(max(np.abs(found.predicted_mean[-1] - mean).max(),
-                          np.abs(found.predicted_covariance[-1] - covariance).max()))
+        result = lfm.filter(model, padded(count, END, ROWS), y, rule=rule, steps=1)
+        errors.append(max(np.abs(result.predicted_mean[-1] - mean).max(),
+                          np.abs(result.predicted_covariance[-1] - covariance).max()))
     assert errors[2] < 1e-6
     assert 3.7 < np.log2(errors[0] / errors[1]) < 4.5, errors
 
@@ -151,9 +151,9 @@ def test_linear_with_coefficients_that_depend_on_time(rule):
         lfm.Gaussian(jnp.ones(1), jnp.zeros((1, 1))), initial_time=0.0)
     errors = []
     for count in (10, 20, 100):
-        found = lfm.filter(model, padded(count, END, ROWS), OBSERVATION, rule=rule, steps=1)
-        errors.append(max(np.abs(found.predicted_mean[-1] - mean).max(),
-                          np.abs(found.predicted_covariance[-1] - covariance).max()))
+        result = lfm.filter(model, padded(count, END, ROWS), OBSERVATION, rule=rule, steps=1)
+        errors.append(max(np.abs(result.predicted_mean[-1] - mean).max(),
+                          np.abs(result.predicted_covariance[-1] - covariance).max()))
     assert errors[2] < 1e-8
     assert 3.7 < np.log2(errors[0] / errors[1]) < 4.7, errors
 

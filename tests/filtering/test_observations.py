@@ -28,8 +28,8 @@ def test_covariance_for_each_time():
     noise = np.array([0.1, 0.2, 0.01, 0.4])[:, None]
     model = lfm.LatentForceModel(*ONE, lfm.GaussianObservation(first_state, jnp.asarray(noise)[:, :, None]), PRIOR,
                                  initial_time=0.0)
-    found = lfm.smooth(model, TIMES, Y, at=[1.5])  # a requested time shifts the rows, not the covariances
-    assert np.isclose(found.log_likelihood.sum(), dense(noise).log_likelihood(TIMES, Y), rtol=1e-10)
+    result = lfm.smooth(model, TIMES, Y, at=[1.5])  # a requested time shifts the rows, not the covariances
+    assert np.isclose(result.log_likelihood.sum(), dense(noise).log_likelihood(TIMES, Y), rtol=1e-10)
 
 
 def test_full_covariance_and_missing_entries():
@@ -53,12 +53,12 @@ def test_covariance_that_depends_on_the_state(rule, points):
     """One update by hand: R is averaged over the points, or taken at the mean."""
     model = lfm.LatentForceModel(
         *ONE, lfm.GaussianObservation(first_state, lambda x, u, t: 0.1 + 0.5 * x**2 + t), PRIOR)
-    found = lfm.filter(model, [0.0], [[0.7]], rule=rule)
+    result = lfm.filter(model, [0.0], [[0.7]], rule=rule)
     at = np.array([0.2]) if points is None else 0.2 + np.sqrt(0.3) * points.nodes[:, 0]
     noise = (np.ones(1) if points is None else points.weights) @ (0.1 + 0.5 * at**2)
     s = 0.3 + noise
-    assert np.isclose(found.log_likelihood[0], -0.5 * (0.25 / s + np.log(2 * np.pi * s)), rtol=1e-10)
-    assert np.isclose(found.filtered_mean[0, 0], 0.2 + 0.3 / s * 0.5, rtol=1e-10)
+    assert np.isclose(result.log_likelihood[0], -0.5 * (0.25 / s + np.log(2 * np.pi * s)), rtol=1e-10)
+    assert np.isclose(result.filtered_mean[0, 0], 0.2 + 0.3 / s * 0.5, rtol=1e-10)
 
 
 @pytest.mark.parametrize("turns", [-2, 0, 3])
@@ -101,12 +101,12 @@ def square_observed(x, u, t):
 def test_non_linear_observation_by_points():
     """Moments of y = x^2 + u / 2 under the prior, in closed form."""
     model = lfm.LatentForceModel(*ONE, lfm.GaussianObservation(square_observed, jnp.array([0.1])), PRIOR)
-    found = lfm.filter(model, [0.0], [[0.7]], rule=lfm.GaussHermite(3))
+    result = lfm.filter(model, [0.0], [[0.7]], rule=lfm.GaussHermite(3))
     m, v = 0.2, 0.3
     mean, variance = m**2 + v, 4 * m**2 * v + 2 * v**2 + 0.25 + 0.1
-    assert np.isclose(found.log_likelihood[0], -0.5 * ((0.7 - mean) ** 2 / variance + np.log(2 * np.pi * variance)),
+    assert np.isclose(result.log_likelihood[0], -0.5 * ((0.7 - mean) ** 2 / variance + np.log(2 * np.pi * variance)),
                       rtol=1e-10)
-    assert np.isclose(found.filtered_mean[0, 0], m + 2 * m * v / variance * (0.7 - mean), rtol=1e-10)
+    assert np.isclose(result.filtered_mean[0, 0], m + 2 * m * v / variance * (0.7 - mean), rtol=1e-10)
 
 
 @pytest.mark.parametrize("link", [identity, pytest.param(softplus, marks=pytest.mark.slow)])
@@ -125,19 +125,19 @@ def test_jumps(link):
         at = np.array([0.5, 0.6, 1.7, 2.0, 3.0])
         reference = dense(np.array([0.1]))
         reference.process.kernels, reference.process.breaks = [kernel], kicks[:3]
-        found = lfm.smooth(model, TIMES, Y, at=at)
+        result = lfm.smooth(model, TIMES, Y, at=at)
         mean, cov = reference.posterior(TIMES, Y, at)
-        assert np.isclose(found.log_likelihood.sum(), reference.log_likelihood(TIMES, Y), rtol=1e-9)
-        assert np.allclose(found.input_mean, mean, atol=1e-9)
-        assert np.allclose(found.input_covariance, cov[np.arange(5), np.arange(5)], atol=1e-9)
-        assert np.allclose(found.leave_one_out, reference.leave_one_out(TIMES, Y), rtol=1e-8)
+        assert np.isclose(result.log_likelihood.sum(), reference.log_likelihood(TIMES, Y), rtol=1e-9)
+        assert np.allclose(result.input_mean, mean, atol=1e-9)
+        assert np.allclose(result.input_covariance, cov[np.arange(5), np.arange(5)], atol=1e-9)
+        assert np.allclose(result.leave_one_out, reference.leave_one_out(TIMES, Y), rtol=1e-8)
     else:
         nonlinear = eqx.tree_at(lambda m: m.forces["u"], motif(softplus, genes=1), force)
         # Without memory a jump makes everything that the force knew irrelevant.
-        found = lfm.filter(nonlinear, TIMES, Y)
+        result = lfm.filter(nonlinear, TIMES, Y)
         other = lfm.filter(motif(softplus, genes=1), TIMES, Y)
-        assert np.isclose(found.log_likelihood[0], other.log_likelihood[0], rtol=1e-10)  # before any jump
-        assert abs(found.log_likelihood[3] - other.log_likelihood[3]) > 1e-3
+        assert np.isclose(result.log_likelihood[0], other.log_likelihood[0], rtol=1e-10)  # before any jump
+        assert abs(result.log_likelihood[3] - other.log_likelihood[3]) > 1e-3
         stationary = np.asarray(force.initial_covariance())
         alone = lfm.filter(nonlinear, [5.0], [[0.4]])
         assert np.abs(alone.predicted_covariance[0, 1:, 1:] - stationary).max() < 1e-10
@@ -176,11 +176,11 @@ def test_iterations_find_the_posterior_linearisation_of_dense_algebra():
         variance = 0.5 * variance + 0.5 * np.diag(k - gain @ a @ k)
     log_likelihood = -0.5 * (innovation @ np.linalg.solve(s, innovation) + np.linalg.slogdet(s)[1]
                              + 4 * np.log(2 * np.pi))
-    found = lfm.smooth(model, TIMES, y[:, None], rule=lfm.GaussHermite(15), steps=1, iterations=200, damping=0.5)
-    assert found.change < 1e-8
-    assert np.allclose(found.force("u").mean, mean, atol=1e-7)
-    assert np.allclose(found.force("u").sd ** 2, variance, atol=1e-7)
-    assert np.isclose(found.log_likelihood.sum(), log_likelihood, rtol=1e-7)
+    result = lfm.smooth(model, TIMES, y[:, None], rule=lfm.GaussHermite(15), steps=1, iterations=200, damping=0.5)
+    assert result.change < 1e-8
+    assert np.allclose(result.force("u").mean, mean, atol=1e-7)
+    assert np.allclose(result.force("u").sd ** 2, variance, atol=1e-7)
+    assert np.isclose(result.log_likelihood.sum(), log_likelihood, rtol=1e-7)
 
 
 def test_iterations_that_go_back_and_forth_meet():
@@ -199,9 +199,9 @@ def test_iterations_converge_on_a_non_linear_drift():
     truth = lfm.simulate(jax.random.key(3), model, times)
     changes = [float(lfm.smooth(model, times, truth.y, steps=4, iterations=n).change) for n in (4, 16)]
     assert changes[1] < 0.05 * changes[0] and changes[1] < 1e-3
-    found = lfm.smooth(model, times, truth.y, steps=4, iterations=16)
+    result = lfm.smooth(model, times, truth.y, steps=4, iterations=16)
     # Honest: the truth lies within the band of +-4 sd at every time.
-    error = np.abs(found.force("u").mean - truth.forces["u"]) / found.force("u").sd
+    error = np.abs(result.force("u").mean - truth.forces["u"]) / result.force("u").sd
     assert error.max() < 4.0
 
 
@@ -209,8 +209,8 @@ def test_iterations_converge_on_a_non_linear_drift():
 def draws():
     model = lfm.LatentForceModel(*ONE, lfm.GaussianObservation(first_state, jnp.array([0.1])), PRIOR, initial_time=0.0)
     at = np.array([0.0, 0.7, 1.0, 1.8, 4.0])
-    found = lfm.smooth(model, TIMES, Y, at=at)
-    sample = found.sample(jax.random.key(0), 4000)
+    result = lfm.smooth(model, TIMES, Y, at=at)
+    sample = result.sample(jax.random.key(0), 4000)
     return at, np.concatenate([sample.state, sample.forces["u"][:, :, None]], axis=2)
 
 
@@ -231,10 +231,10 @@ def test_trajectories_have_the_joint_posterior(draws):
 
 def test_double_well_trajectories_are_marginally_the_smoother():
     model = double_well()
-    found = lfm.smooth(model, TIMES, Y, at=[0.0, 0.5, 2.5])
-    sample = found.sample(jax.random.key(1), 2000)
+    result = lfm.smooth(model, TIMES, Y, at=[0.0, 0.5, 2.5])
+    sample = result.sample(jax.random.key(1), 2000)
     assert sample.state.shape == (2000, 3, 1) and sample.forces == {}
-    z = (sample.state[:, :, 0].mean(0) - found.state("x0").mean) / (found.state("x0").sd / np.sqrt(2000))
+    z = (sample.state[:, :, 0].mean(0) - result.state("x0").mean) / (result.state("x0").sd / np.sqrt(2000))
     assert np.abs(z).max() < 4.5
-    ratio = sample.state[:, :, 0].var(0) / found.state("x0").sd ** 2
+    ratio = sample.state[:, :, 0].var(0) / result.state("x0").sd ** 2
     assert np.abs(ratio - 1).max() < 4.5 * np.sqrt(2 / 2000)

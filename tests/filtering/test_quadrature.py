@@ -103,10 +103,10 @@ def test_simpson_gives_the_numbers_of_runge_kutta(name, steps, monkeypatch):
     ssm = case(name)
     rule = RULES["taylor" if name == "softplus" and steps == 3 else "cubature"]
     assert is_nonlinear_in_forces_only(ssm, rule)
-    found = predictions(ssm, rule, steps)
+    result = predictions(ssm, rule, steps)
     monkeypatch.setattr(predict, "is_nonlinear_in_forces_only", lambda *_: False)
     expected = predictions(ssm, rule, steps)
-    for one, other in zip(*map(jax.tree_util.tree_leaves, (found, expected)), strict=True):
+    for one, other in zip(*map(jax.tree_util.tree_leaves, (result, expected)), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(other).max(initial=0.0))
 
 
@@ -143,9 +143,9 @@ def test_without_forces(monkeypatch):
         return [lfm.MarginalLikelihood(model, np.arange(4.0), steps=3, iterations=count).log_prob(jnp.ones((4, 1)))
                 for count in (0, 2)]
 
-    found = log_likelihoods(model)
+    result = log_likelihoods(model)
     assert lfm.smooth(model, np.arange(4.0), np.ones((4, 1)), at=[0.5, 3.5], steps=3, iterations=2).mean.shape == (2, 1)
     asked = []
     monkeypatch.setattr(predict, "is_nonlinear_in_forces_only", lambda *_: bool(asked.append(None)))
-    np.testing.assert_allclose(found, log_likelihoods(same), rtol=1e-12)
+    np.testing.assert_allclose(result, log_likelihoods(same), rtol=1e-12)
     assert asked, "compiled anew, without Simpson's rule"

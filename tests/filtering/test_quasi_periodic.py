@@ -62,12 +62,12 @@ def dense(evolution):
 def test_a_driven_state_is_that_of_dense_algebra(evolution):
     """All eigenfunctions above 1e-12; times asked for, one of them a change point; replicates; a missing entry."""
     force = lfm.QuasiPeriodic(kernel(), EVOLUTIONS[evolution], gamma=1e-12)
-    found = lfm.smooth(model(force), TIMES, Y, at=AT)
+    result = lfm.smooth(model(force), TIMES, Y, at=AT)
     reference = dense(evolution)
-    assert abs(float(found.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-6
+    assert abs(float(result.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-6
     mean, covariance = reference.posterior(TIMES, Y, AT)
-    np.testing.assert_allclose(found.input_mean, mean, atol=1e-6)
-    np.testing.assert_allclose(found.input_covariance, covariance[np.arange(6), np.arange(6)], atol=1e-6)
+    np.testing.assert_allclose(result.input_mean, mean, atol=1e-6)
+    np.testing.assert_allclose(result.input_covariance, covariance[np.arange(6), np.arange(6)], atol=1e-6)
 
 
 @pytest.mark.slow
@@ -79,8 +79,8 @@ def test_a_kernel_that_is_not_stationary_drives_a_state():
     covariance = eqx.filter_jit(force.sde_covariance)
     reference.process.kernels = [lambda t, s: np.asarray(covariance(t, s))]
     reference.process.breaks = (1.5, 3.0, 4.5, 6.0, 7.5)
-    found = lfm.filter(model(force), TIMES, Y, steps=40)
-    assert abs(float(found.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-5
+    result = lfm.filter(model(force), TIMES, Y, steps=40)
+    assert abs(float(result.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-5
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -92,8 +92,8 @@ def test_every_rule_is_exact_where_nothing_is_curved(rule):
 
     force = lfm.QuasiPeriodic(kernel(), forces.WQM(0.5, POINTS), functions=9)
     expected = lfm.filter(model(force), TIMES, Y).log_likelihood
-    found = lfm.filter(model(force, dynamics), TIMES, Y, rule=RULES[rule], steps=20).log_likelihood
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    result = lfm.filter(model(force, dynamics), TIMES, Y, rule=RULES[rule], steps=20).log_likelihood
+    np.testing.assert_allclose(result, expected, atol=1e-6)
 
 
 def link(x, u, t):
@@ -124,10 +124,10 @@ def test_a_panel_is_a_loop():
 
     parameters = {"lengthscale": jnp.array([1.0, 2.0]), "period": jnp.array([3.0, 2.5])}
     y = jnp.stack([jnp.asarray(Y), 2.0 * jnp.asarray(Y)])
-    found = jax.jit(lambda p, y: lfm.panel(build, p, TIMES).log_prob(y))(parameters, y)
+    result = jax.jit(lambda p, y: lfm.panel(build, p, TIMES).log_prob(y))(parameters, y)
     each = [lfm.MarginalLikelihood(build({"lengthscale": a, "period": b}), TIMES).log_prob(one)
             for a, b, one in zip((1.0, 2.0), (3.0, 2.5), y, strict=True)]
-    np.testing.assert_allclose(found, each, rtol=1e-10)
+    np.testing.assert_allclose(result, each, rtol=1e-10)
 
 
 def test_gradients_of_the_likelihood_are_finite_differences():
@@ -152,8 +152,8 @@ def test_a_resonator_with_a_bias_is_that_of_dense_algebra():
         covariance = eqx.filter_jit(force.covariance)
         reference.process.kernels = [lambda t, s, covariance=covariance: np.asarray(covariance(t, s))]
         reference.process.means = [lambda t: 1.5 + np.zeros_like(t)]
-        found = lfm.filter(model(force), TIMES, Y)
-        assert abs(float(found.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-8
+        result = lfm.filter(model(force), TIMES, Y)
+        assert abs(float(result.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-8
 
 
 @pytest.mark.slow

@@ -83,13 +83,13 @@ def importance(name, y, mean, cov, draws=DRAWS):
     theta, k, size = np.asarray(THETA), covariance(np.asarray(THETA)), TIMES.size
     prior = np.linalg.inv(k + 1e-12 * np.eye(size))
     proposal = stats.multivariate_t(mean, cov, df=8, seed=np.random.default_rng(2))
-    found, log_weight = [], []
+    result, log_weight = [], []
     for _ in range(0, draws, DRAWS):
         f = proposal.rvs(DRAWS)
-        found.append(f)
+        result.append(f)
         log_weight.append(FAMILIES[name][1](y.T, f, theta).sum(1) - 0.5 * np.einsum("ij,jk,ik->i", f, prior, f)
                           + 0.5 * np.linalg.slogdet(prior)[1] - 0.5 * size * np.log(2 * np.pi) - proposal.logpdf(f))
-    f, log_weight = np.concatenate(found), np.concatenate(log_weight)
+    f, log_weight = np.concatenate(result), np.concatenate(log_weight)
     weight = np.exp(log_weight - log_weight.max())
     error = weight.std() / weight.mean() / np.sqrt(len(f))
     share = weight / weight.sum()
@@ -157,7 +157,7 @@ def test_evidence_and_moments_of_many_records(name):
         drawn = result.sample(jax.random.key(0), 4000).forces["u"]
         return distribution.log_prob(y), *result.force("u"), jnp.cov(drawn.T)
 
-    found = []
+    computed = []
     for seed in range(16):
         rng = np.random.default_rng(seed)
         y = FAMILIES[name][2](rng, np.linalg.cholesky(k + 1e-12 * np.eye(len(k))) @ rng.normal(size=len(k)))
@@ -165,9 +165,9 @@ def test_evidence_and_moments_of_many_records(name):
         log_z, error, first, spread = importance(name, y.astype(float)[:, None], mean, 1.25 * cov, 500_000)
         if name == "Student-t":  # two modes are too much for the weights
             first, spread = exact_moments(y)
-        found.append([abs(log_evidence - log_z), np.max(np.abs(mean - first) / spread),
+        computed.append([abs(log_evidence - log_z), np.max(np.abs(mean - first) / spread),
                       np.max(np.abs(sd / spread - 1.0)), error])
-    away = np.array(found)
+    away = np.array(computed)
     print(f"{name}: log evidence, means, sds, error of the reference: median {np.median(away, 0).round(3)}, "
           f"largest {away.max(0).round(3)}")
     away = away[away[:, 3] < 0.02]
@@ -245,8 +245,8 @@ def test_with_gaussian_sites_it_is_the_gaussian_filter():
         return lfm.MarginalLikelihood(model, TIMES).log_prob(y)
 
     expected, gradient = jax.jit(jax.value_and_grad(lambda th: log_prob(th, lambda g: g)))(THETA)
-    found, of_sites = jax.jit(jax.value_and_grad(lambda th: log_prob(th, lfm.Observations)))(THETA)
-    assert found == pytest.approx(float(expected), rel=1e-12)
+    result, of_sites = jax.jit(jax.value_and_grad(lambda th: log_prob(th, lfm.Observations)))(THETA)
+    assert result == pytest.approx(float(expected), rel=1e-12)
     np.testing.assert_allclose(of_sites, gradient, rtol=1e-12, atol=1e-11)
 
 
@@ -264,14 +264,14 @@ def test_update_in_natural_parameters_against_dense_algebra():
     precision = np.linalg.inv(prior) + both.T @ np.diag(tau) @ both
     posterior = np.linalg.inv(precision)
     shift = both.T @ (nu - tau * (value - centre))
-    found = multiply_by_sites(LinearizedObservation(jnp.asarray(value), jnp.asarray(h), jnp.asarray(omega)),
+    result = multiply_by_sites(LinearizedObservation(jnp.asarray(value), jnp.asarray(h), jnp.asarray(omega)),
                               Sites(*map(jnp.asarray, (centre, nu, tau))), Moments(jnp.asarray(m), jnp.asarray(p)))
-    np.testing.assert_allclose(found.moments.mean, m + (posterior @ shift)[:4], rtol=1e-8)
-    np.testing.assert_allclose(found.moments.covariance, posterior[:4, :4], rtol=1e-8)
+    np.testing.assert_allclose(result.moments.mean, m + (posterior @ shift)[:4], rtol=1e-8)
+    np.testing.assert_allclose(result.moments.covariance, posterior[:4, :4], rtol=1e-8)
     away = value - centre
     integral = (nu @ away - 0.5 * away @ (tau * away) + 0.5 * shift @ posterior @ shift
                 - 0.5 * np.linalg.slogdet(prior)[1] - 0.5 * np.linalg.slogdet(precision)[1])
-    assert found.log_likelihood == pytest.approx(integral, rel=1e-6)
+    assert result.log_likelihood == pytest.approx(integral, rel=1e-6)
 
 
 @pytest.mark.slow
@@ -340,10 +340,10 @@ COUNTS = np.array([1.0, 2.0, 0.0, 3.0])[:, None]
 
 def test_replicates_with_steps_that_follow_a_tolerance():
     """Smoothed moments are those of counts that follow each other at once."""
-    found, expected = (lfm.smooth(pushed(THETA), times, COUNTS, lfm.Taylor(), tolerance=1e-2)
+    result, expected = (lfm.smooth(pushed(THETA), times, COUNTS, lfm.Taylor(), tolerance=1e-2)
                        for times in (AT_ONCE, ONE_AFTER_ANOTHER))
-    np.testing.assert_allclose(found.input_mean, expected.input_mean, rtol=1e-6)
-    np.testing.assert_allclose(found.input_covariance, expected.input_covariance, rtol=1e-6)
+    np.testing.assert_allclose(result.input_mean, expected.input_mean, rtol=1e-6)
+    np.testing.assert_allclose(result.input_covariance, expected.input_covariance, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -352,8 +352,8 @@ def test_gradients_of_replicates_with_steps_that_follow_a_tolerance():
         return jax.jit(jax.value_and_grad(
             lambda theta: lfm.MarginalLikelihood(pushed(theta), times, tolerance=1e-3).log_prob(COUNTS)))(THETA)
 
-    for found, expected in zip(likelihood(AT_ONCE), likelihood(ONE_AFTER_ANOTHER), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    for result, expected in zip(likelihood(AT_ONCE), likelihood(ONE_AFTER_ANOTHER), strict=True):
+        np.testing.assert_allclose(result, expected, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -365,14 +365,14 @@ def test_steps_that_follow_a_tolerance_give_the_moments_at_any_time(linear):
                                  lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
     times, at = 0.5 * np.arange(8.0), np.array([0.0, 0.7, 2.0, 3.2, 4.0])
     y = np.random.default_rng(0).poisson(1.5, (8, 1)).astype(float)
-    found, whole = (lfm.smooth(model, times, y, at=wanted, tolerance=1e-5) for wanted in (at, None))
-    np.testing.assert_allclose(found.input_mean[:3:2], whole.input_mean[:5:4], atol=1e-9)
-    np.testing.assert_allclose(found.input_covariance[:3:2], whole.input_covariance[:5:4], atol=1e-4)
-    assert np.isfinite(found.sample(jax.random.key(0), 3).state).all()
+    result, whole = (lfm.smooth(model, times, y, at=wanted, tolerance=1e-5) for wanted in (at, None))
+    np.testing.assert_allclose(result.input_mean[:3:2], whole.input_mean[:5:4], atol=1e-9)
+    np.testing.assert_allclose(result.input_covariance[:3:2], whole.input_covariance[:5:4], atol=1e-4)
+    assert np.isfinite(result.sample(jax.random.key(0), 3).state).all()
     if linear:
         fixed = lfm.smooth(model, times, y, at=at, steps=20)
-        np.testing.assert_allclose(found.input_mean, fixed.input_mean, atol=1e-4)
-        np.testing.assert_allclose(found.input_covariance, fixed.input_covariance, atol=1e-4)
+        np.testing.assert_allclose(result.input_mean, fixed.input_mean, atol=1e-4)
+        np.testing.assert_allclose(result.input_covariance, fixed.input_covariance, atol=1e-4)
 
 
 HOPELESS = SiteSettings(sweeps=1, relinearisations=2)
@@ -496,8 +496,8 @@ def test_residuals_of_a_gaussian_part_are_whitened_innovations():
     noise = lfm.GaussianObservation(force, jnp.array([0.3]))
     plain = lfm.filter(process(noise), TIMES, y)
     family = process(lfm.Observations(noise))
-    for found in (lfm.filter(family, TIMES, y), lfm.smooth(family, TIMES, y)):
-        np.testing.assert_allclose(found.whitened_innovation, plain.whitened_innovation, atol=1e-7)
+    for result in (lfm.filter(family, TIMES, y), lfm.smooth(family, TIMES, y)):
+        np.testing.assert_allclose(result.whitened_innovation, plain.whitened_innovation, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["negative binomial", "Student-t"])

@@ -36,8 +36,8 @@ def test_the_log_likelihood_does_not_depend_on_the_origin(origin, jitter, rate):
     for drag in (0.0, 0.3) if rate > 1.0 else (0.0,):
         model = oscillator(rate, drag)
         expected = lfm.filter(model, since, y, steps=4)
-        found = lfm.filter(model, times, y, steps=4)
-        np.testing.assert_allclose(found.log_likelihood, expected.log_likelihood, atol=1e-9)
+        result = lfm.filter(model, times, y, steps=4)
+        np.testing.assert_allclose(result.log_likelihood, expected.log_likelihood, atol=1e-9)
 
 
 def test_moments_at_requested_times_do_not_depend_on_the_origin():
@@ -46,9 +46,9 @@ def test_moments_at_requested_times_do_not_depend_on_the_origin():
     y = np.sin(2 * np.pi * 80.0 * since)[:, None]
     model = oscillator(1e3, 0.3)
     expected = lfm.smooth(model, since, y, at=requested - times[0], steps=4, iterations=2)
-    found = lfm.smooth(model, times, y, at=requested, steps=4, iterations=2)
-    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-7, atol=1e-8)
+    result = lfm.smooth(model, times, y, at=requested, steps=4, iterations=2)
+    np.testing.assert_allclose(result.mean, expected.mean, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(result.covariance, expected.covariance, rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.parametrize("times", [
@@ -66,8 +66,8 @@ def test_interval_lengths_are_not_chained():
     length = 1.0 + 4 * np.finfo(float).eps * np.arange(500)
     times = np.concatenate([[0.0], np.cumsum(length)])
     grid = build_time_grid(state_space(oscillator(1.0)), times, 1)
-    found = np.asarray(grid.lengths)[grid.intervals.length_index]
-    np.testing.assert_allclose(found, grid.intervals.length, rtol=2e-15, atol=0.0)
+    result = np.asarray(grid.lengths)[grid.intervals.length_index]
+    np.testing.assert_allclose(result, grid.intervals.length, rtol=2e-15, atol=0.0)
 
 
 def test_a_known_input_is_read_on_the_side_of_the_interval():
@@ -82,5 +82,5 @@ def test_a_known_input_is_read_on_the_side_of_the_interval():
             lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
 
     y = np.zeros((ROWS, 1))
-    expected, found = lfm.filter(model(since), since, y), lfm.filter(model(times), times, y)
-    np.testing.assert_allclose(found.log_likelihood, expected.log_likelihood, atol=1e-9)
+    expected, result = lfm.filter(model(since), since, y), lfm.filter(model(times), times, y)
+    np.testing.assert_allclose(result.log_likelihood, expected.log_likelihood, atol=1e-9)

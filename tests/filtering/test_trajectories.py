@@ -41,11 +41,11 @@ def assert_draws_have_the_moments_of(result):
     mean, covariance = np.asarray(result.input_mean), np.asarray(result.input_covariance)
     wanted, scale = standardised(covariance)
     away = (w - mean) * scale
-    found = np.einsum("dki,dkj->kij", away, away) / DRAWS
+    computed = np.einsum("dki,dkj->kij", away, away) / DRAWS
     np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=4.5 / np.sqrt(DRAWS))
-    variances = np.diagonal(found, axis1=1, axis2=2)[scale > 0]
+    variances = np.diagonal(computed, axis1=1, axis2=2)[scale > 0]
     np.testing.assert_allclose(np.sqrt(variances), 1.0, atol=0.02)
-    np.testing.assert_allclose(found, wanted, atol=4.5 * np.sqrt(2.0 / DRAWS))
+    np.testing.assert_allclose(computed, wanted, atol=4.5 * np.sqrt(2.0 / DRAWS))
     still = np.broadcast_to(scale == 0, away.shape)
     assert np.abs((w - mean)[still]).max(initial=0.0) < 1e-9, "what is known does not vary"
 

@@ -77,9 +77,9 @@ def target(units, known=False):
 def observations():
     """Distances in metres, one of them missing."""
     simulated = lfm.simulate(jax.random.key(0), target(METRIC, known=True), np.append(0.0, TIMES), steps=5)
-    found = np.array(simulated.y)[1:]
-    found[7] = np.nan
-    return found
+    result = np.array(simulated.y)[1:]
+    result[7] = np.nan
+    return result
 
 
 @functools.cache
@@ -101,11 +101,11 @@ def test_the_likelihood_is_the_same_density(name, units):
 def smoothed(units, known, iterations):
     """Means, covariances and leave-one-out densities in metres and seconds."""
     y, at = observations(), np.linspace(0.0, 21.0, 30)
-    found = lfm.smooth(target(units, known), TIMES * units.time, y * units.distance, steps=4, at=at * units.time,
+    result = lfm.smooth(target(units, known), TIMES * units.time, y * units.distance, steps=4, at=at * units.time,
                        iterations=iterations)
     scale = np.append(units.state, units.force)
-    return (np.asarray(found.input_mean) / scale, np.asarray(found.input_covariance) / np.outer(scale, scale),
-            np.asarray(found.leave_one_out) + np.isfinite(y[:, 0]) * np.log(units.distance))
+    return (np.asarray(result.input_mean) / scale, np.asarray(result.input_covariance) / np.outer(scale, scale),
+            np.asarray(result.leave_one_out) + np.isfinite(y[:, 0]) * np.log(units.distance))
 
 
 @pytest.mark.parametrize("iterations", [0, pytest.param(2, marks=pytest.mark.slow)])

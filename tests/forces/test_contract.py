@@ -131,8 +131,8 @@ def derivatives(build, points):
     Returns:
         Values, derivatives in forward mode, derivatives in reverse mode: one compiled program for a force.
     """
-    found = _derivatives(build)(np.resize(points, (24, 3)))
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[:len(points)], found)
+    result = _derivatives(build)(np.resize(points, (24, 3)))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:len(points)], result)
 
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])

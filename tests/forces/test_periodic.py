@@ -50,7 +50,7 @@ def test_fourier_coefficients_are_bessel_functions(lengthscale):
 @pytest.mark.parametrize("order", range(3))
 def test_fourier_coefficients_of_rough_kernels_are_their_integrals(order):
     kernel = forces.PeriodicMatern(1.3, 0.4, 7.0, order)
-    found = fourier_coefficients(kernel, 12)
+    result = fourier_coefficients(kernel, 12)
     for j in (0, 1, 5, 12):
         x = np.sqrt(2 * order + 1) / 0.4
 
@@ -59,7 +59,7 @@ def test_fourier_coefficients_of_rough_kernels_are_their_integrals(order):
             return 1.3**2 * np.exp(-y) * (1, 1 + y, 1 + y + y * y / 3)[order]
 
         integral = quad(value, 0.0, 3.5, weight="cos", wvar=2 * np.pi * j / 7.0, epsabs=1e-12)[0]
-        assert_allclose(found[j], integral * (2 if j else 1) / 3.5, atol=1e-10)
+        assert_allclose(result[j], integral * (2 if j else 1) / 3.5, atol=1e-10)
 
 
 @pytest.mark.parametrize("order", [0, 1, 2, "se"])
@@ -228,9 +228,9 @@ def test_simulated_weights_have_the_published_covariance(evolution):
     exact = {"CQM": np.exp(-np.abs(t[:, None] - t) / 12.0), "SQM": np.exp(-(later - earlier) / 1.5),
              "WQM": 1.0 + 0.4 * earlier}[type(evolution).__name__]
     assert_allclose(evolution.covariance(t[:, None], t), exact, rtol=1e-12)
-    found = drawn.T @ drawn / draws
+    result = drawn.T @ drawn / draws
     error = np.sqrt((np.outer(np.diag(exact), np.diag(exact)) + exact**2) / draws)
-    assert (np.abs(found - exact) < 4 * error).all()
+    assert (np.abs(result - exact) < 4 * error).all()
 
 
 def test_change_points_before_the_initial_time_do_not_count():
@@ -242,9 +242,9 @@ def test_change_points_before_the_initial_time_do_not_count():
 def test_a_sum_with_jumps_has_the_covariances_of_its_terms():
     force = lfm.QuasiPeriodic(squared_exponential(), forces.SQM(2.0, POINTS), functions=5)
     t = np.array([3.0, 8.0, 20.0, 37.0])
-    found = (force + lfm.Matern(2.0, 3.0)).sde_covariance(t[:, None], t)
+    result = (force + lfm.Matern(2.0, 3.0)).sde_covariance(t[:, None], t)
     expected = force.sde_covariance(t[:, None], t) + lfm.Matern(2.0, 3.0).covariance(t[:, None], t)
-    assert_allclose(found, expected, atol=1e-12)
+    assert_allclose(result, expected, atol=1e-12)
 
 
 def test_a_spectrum_of_lines_has_no_density():
@@ -268,11 +268,11 @@ def test_the_covariance_of_the_state_space_form_is_that_of_the_basis():
 @pytest.mark.slow
 def test_resonators_carry_the_kernel():
     kernel = forces.PeriodicMatern(1.3, 0.7, 24.0, 1)
-    found = forces.resonators(kernel, functions=9, mean=2.0)
+    result = forces.resonators(kernel, functions=9, mean=2.0)
     exact = lfm.Periodic(kernel, functions=9).sde_covariance(LAG[:, None], LAG)
-    assert_allclose(found.covariance(LAG[:, None], LAG), exact, atol=1e-12)
-    assert [float(force.period) for force in found.forces[1:]] == [24.0, 12.0, 8.0, 6.0]
-    assert float(found.mean_at(5.0)) == 2.0
+    assert_allclose(result.covariance(LAG[:, None], LAG), exact, atol=1e-12)
+    assert [float(force.period) for force in result.forces[1:]] == [24.0, 12.0, 8.0, 6.0]
+    assert float(result.mean_at(5.0)) == 2.0
     moving = forces.resonators(kernel, functions=3, noise=0.1, damping=0.02)
     scale = float(moving.forces[1].scale)
     assert float(moving.forces[1].noise) == pytest.approx(0.1 * scale) and float(moving.forces[1].damping) == 0.02

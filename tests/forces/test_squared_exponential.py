@@ -84,11 +84,11 @@ def fitted(order, last):
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_constants_are_those_of_the_fit(order):
     delta = _FITS[order].delta
-    found, expected = fitted(order, delta), stored(order)
-    costs = [(residuals(order, delta, p) ** 2).sum() for p in (found, expected)]
+    result, expected = fitted(order, delta), stored(order)
+    costs = [(residuals(order, delta, p) ** 2).sum() for p in (result, expected)]
     assert_allclose(costs[1], costs[0], rtol=1e-6)
     omega = np.linspace(0.0, 12.0, 121)
-    assert_allclose(rational(order, found, omega), rational(order, expected, omega), rtol=1e-5, atol=1e-5 * delta)
+    assert_allclose(rational(order, result, omega), rational(order, expected, omega), rtol=1e-5, atol=1e-5 * delta)
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -229,10 +229,10 @@ def test_posterior_of_the_force_is_that_of_the_exact_process():
     for ell in (0.1, 1.0):
         ell, sd, times, y, exact = draw(rng, 60, True, ell, 0.03)
         mean, covariance = exact.posterior(times, y, times)
-        found = lfm.smooth(model(ell, sd, DEFAULT, True, 1.0), times, y).force("u")
+        result = lfm.smooth(model(ell, sd, DEFAULT, True, 1.0), times, y).force("u")
         deviation = np.sqrt(covariance[np.arange(60), np.arange(60), 1, 1])
-        assert np.abs(np.ravel(found.mean) - mean[:, 1]).max() < 0.02 * deviation.min()
-        assert_allclose(np.ravel(found.sd), deviation, rtol=0.02)
+        assert np.abs(np.ravel(result.mean) - mean[:, 1]).max() < 0.02 * deviation.min()
+        assert_allclose(np.ravel(result.sd), deviation, rtol=0.02)
 
 
 @pytest.mark.slow

@@ -118,10 +118,10 @@ def test_filter_and_smoother_at_a_draw_are_the_librarys(bound):
     system = systems.motif(decay=0.8, lengthscale=1.3, noise_sd=VALUES["noise_sd"])
     z = bound.unconstrain(VALUES)
     expected = lfm.filter(system, TIMES, Y, steps=2)
-    for found in (bound.filter(z), bound.filter(VALUES)):
-        np.testing.assert_allclose(found.log_likelihood, expected.log_likelihood, rtol=1e-10)
-        np.testing.assert_allclose(found.filtered_mean, expected.filtered_mean, atol=1e-10)
-    assert float(found.log_likelihood.sum()) == pytest.approx(float(bound.log_likelihood(z)), rel=1e-10)
+    for result in (bound.filter(z), bound.filter(VALUES)):
+        np.testing.assert_allclose(result.log_likelihood, expected.log_likelihood, rtol=1e-10)
+        np.testing.assert_allclose(result.filtered_mean, expected.filtered_mean, atol=1e-10)
+    assert float(result.log_likelihood.sum()) == pytest.approx(float(bound.log_likelihood(z)), rel=1e-10)
     at = np.array([0.2, 3.5])
     smoothed = lfm.smooth(system, TIMES, OTHER, steps=2, at=at)
     again = bound.smooth(z, at, OTHER)
@@ -162,9 +162,9 @@ def test_what_decides_the_program_is_never_mixed_up(bound, change):
     given = {"times": TIMES, "y": Y, **change}
     times, y = given.pop("times"), given.pop("y")
     lfm.bind(sized, TIMES, Y)
-    found = lfm.bind(sized, times, y, **given)
-    expected = -potential_energy(sized, (times, y), given, found.unravel(np.zeros(1)))
-    assert float(found.log_density(np.zeros(1))) == pytest.approx(float(expected), rel=1e-12)
+    result = lfm.bind(sized, times, y, **given)
+    expected = -potential_energy(sized, (times, y), given, result.unravel(np.zeros(1)))
+    assert float(result.log_density(np.zeros(1))) == pytest.approx(float(expected), rel=1e-12)
 
 
 @pytest.mark.parametrize("sampler, model, fixed", [
@@ -178,9 +178,9 @@ def test_a_second_data_set_compiles_nothing_in_fit(sampler, model, fixed):
     with pytest.warns() if sampler != "map" else contextlib.nullcontext():
         lfm.fit(model, TIMES, Y, **settings)
     with compilations() as compiled, pytest.warns() if sampler != "map" else contextlib.nullcontext():
-        found = lfm.fit(model, TIMES, OTHER, **settings)
+        result = lfm.fit(model, TIMES, OTHER, **settings)
     assert compiled == []
-    np.testing.assert_array_equal(group(found, "observed_data")["y"].values, OTHER)
+    np.testing.assert_array_equal(group(result, "observed_data")["y"].values, OTHER)
 
 
 def test_a_second_data_set_compiles_nothing_in_map_and_check():
@@ -276,14 +276,14 @@ def test_a_model_that_asks_its_data_for_values():
         rate = numpyro.sample("decay", dist.LogNormal(shift, 0.3))
         numpyro.sample("y", lfm.MarginalLikelihood(systems.motif(systems.identity, decay=rate), times, steps=2), obs=y)
 
-    found = lfm.bind(looks, TIMES, Y)
+    computed = lfm.bind(looks, TIMES, Y)
     expected = -float(potential_energy(looks, (TIMES, Y), {}, {"decay": jnp.array(0.1)}))
-    assert float(found.log_density(np.array([0.1]))) == pytest.approx(expected, rel=1e-12)
+    assert float(computed.log_density(np.array([0.1]))) == pytest.approx(expected, rel=1e-12)
     with pytest.raises(ValueError, match="needs the values of its data.*with_data"):
-        found.log_density(np.array([0.1]), OTHER)
+        computed.log_density(np.array([0.1]), OTHER)
     result = lfm.fit(looks, TIMES, Y, sampler="map", samples=5, trajectory_draws=2, progress=False)
     assert group(result, "log_likelihood")["y"].shape == (1, 5, 5) and "forces" in group(result, "trajectories")
-    other = found.with_data(OTHER)
+    other = computed.with_data(OTHER)
     expected = -float(potential_energy(looks, (TIMES, OTHER), {}, {"decay": jnp.array(0.1)}))
     assert float(other.log_density(np.array([0.1]))) == pytest.approx(expected, rel=1e-12)
 
@@ -294,9 +294,9 @@ def test_times_that_a_model_computes_with_stay_known():
         system = systems.motif(systems.identity, decay=rate)
         numpyro.sample("y", lfm.MarginalLikelihood(system, jnp.asarray(times) * 2.0, steps=2), obs=y)
 
-    found = lfm.bind(hours, TIMES, Y).smooth({"decay": 1.2}, at=[0.5, 7.0])  # requested times need known ones
+    result = lfm.bind(hours, TIMES, Y).smooth({"decay": 1.2}, at=[0.5, 7.0])  # requested times need known ones
     expected = lfm.smooth(systems.motif(systems.identity, decay=1.2), TIMES * 2.0, Y, steps=2, at=[0.5, 7.0])
-    np.testing.assert_allclose(found.force("u").mean, expected.force("u").mean, atol=1e-10)
+    np.testing.assert_allclose(result.force("u").mean, expected.force("u").mean, atol=1e-10)
 
 
 def test_a_panel():
@@ -306,12 +306,12 @@ def test_a_panel():
             numpyro.sample("y", lfm.panel(lambda p: systems.motif(decay=p), decay * jnp.ones(2), times, steps=2), obs=y)
 
     both = np.stack([Y, OTHER])
-    found = lfm.bind(several, TIMES, both)
+    result = lfm.bind(several, TIMES, both)
     z = np.array([0.1])
     parts = [lfm.MarginalLikelihood(systems.motif(decay=np.exp(0.1)), TIMES, steps=2).log_prob(y) for y in both]
-    assert float(found.log_likelihood(z)) == pytest.approx(float(sum(parts)), rel=1e-10)
+    assert float(result.log_likelihood(z)) == pytest.approx(float(sum(parts)), rel=1e-10)
     with pytest.raises(ValueError, match="smooth takes one series"):
-        found.smooth(z)
+        result.smooth(z)
 
 
 def _bound_before_and_after(change):
@@ -382,9 +382,9 @@ def test_times_may_follow_from_parameters_or_data():
 
     for times in (TIMES, 2.0 * TIMES):
         data = {"times": jnp.asarray(times), "y": jnp.asarray(Y)}
-        found = bind_arguments(packed, (data,), {}).log_density(np.array([0.1]))
+        result = bind_arguments(packed, (data,), {}).log_density(np.array([0.1]))
         expected = -potential_energy(packed, (data,), {}, {"decay": 0.1})
-        assert float(found) == pytest.approx(float(expected), rel=1e-12)
+        assert float(result) == pytest.approx(float(expected), rel=1e-12)
 
 
 def test_binding_runs_a_model_with_numbers_and_with_tracers():

@@ -34,20 +34,20 @@ def softplus(times, y=None):
     motif(times, y, jax.nn.softplus, steps=4)
 
 
-def assert_uniform(name, found, bins):
+def assert_uniform(name, result, bins):
     """No statistic of any scalar is rarer than one in a thousand under uniform ranks."""
     if folder := os.environ.get("LFM_SBC_OUT"):
-        calibration.save(found, Path(folder) / name, overwrite=True)
-    values = {scalar: calibration.p_values(rank, found.draws, bins) for scalar, rank in found.ranks.items()}
+        calibration.save(result, Path(folder) / name, overwrite=True)
+    values = {scalar: calibration.p_values(rank, result.draws, bins) for scalar, rank in result.ranks.items()}
     print(name, values)
     assert min(min(pair.values()) for pair in values.values()) > 0.001, values
 
 
 @pytest.mark.slow
 def test_ram_is_calibrated_on_the_linear_motif():
-    found = calibration.calibrate(jax.random.key(11), motif, TIMES, lfm.RAM, data_sets=40, thin=40, warmup=1000)
-    assert set(found.ranks) == {"decay", "sensitivity", "lengthscale", "noise_sd", "log likelihood"}
-    assert_uniform("small_ram_linear", found, bins=8)
+    result = calibration.calibrate(jax.random.key(11), motif, TIMES, lfm.RAM, data_sets=40, thin=40, warmup=1000)
+    assert set(result.ranks) == {"decay", "sensitivity", "lengthscale", "noise_sd", "log likelihood"}
+    assert_uniform("small_ram_linear", result, bins=8)
 
 
 @pytest.mark.slow
@@ -58,5 +58,5 @@ def test_samplers_are_calibrated(sampler, model):
         "nuts": {"kernel": lambda m: NUTS(m, forward_mode_differentiation=True), "thin": 3, "warmup": 300, "batch": 20},
         "ram": {"kernel": lfm.RAM, "thin": 60, "warmup": 2000},
     }[sampler]
-    found = calibration.calibrate(jax.random.key(12), model, TIMES, data_sets=240, **settings)
-    assert_uniform(f"{sampler}_{model.__name__}", found, bins=16)
+    result = calibration.calibrate(jax.random.key(12), model, TIMES, data_sets=240, **settings)
+    assert_uniform(f"{sampler}_{model.__name__}", result, bins=16)

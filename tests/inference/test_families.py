@@ -101,8 +101,8 @@ FAMILIES = {"Poisson": poisson, "Poisson, softplus": softplus_poisson, "negative
 FILES = {"coal": {}, "epidemic": {}, "transcription": {"df": 4.0}, "ballistic": {"df": 4.0}}
 
 
-def assert_uniform(found, bins):
-    values = {name: calibration.p_values(rank, found.draws, bins) for name, rank in found.ranks.items()}
+def assert_uniform(result, bins):
+    values = {name: calibration.p_values(rank, result.draws, bins) for name, rank in result.ranks.items()}
     print(values)
     assert min(min(pair.values()) for pair in values.values()) > 0.001, values
 
@@ -110,18 +110,18 @@ def assert_uniform(found, bins):
 @pytest.mark.slow
 def test_random_walks_with_expectation_propagation_are_calibrated():
     """A small one: 24 data sets of 6 rows, and random walks, whose program is a fraction of that of NUTS."""
-    found = calibration.calibrate(jax.random.key(4), counts, np.arange(6.0), lfm.RAM, data_sets=24, draws=15, thin=20,
+    result = calibration.calibrate(jax.random.key(4), counts, np.arange(6.0), lfm.RAM, data_sets=24, draws=15, thin=20,
                                   warmup=200)
-    assert_uniform(found, bins=4)
+    assert_uniform(result, bins=4)
 
 
 def test_nuts_with_expectation_propagation_is_calibrated_on_few_counts():
     """A small one of the next: 40 data sets of 6 rows, two parameters."""
-    found = calibration.calibrate(jax.random.key(3), counts, np.arange(6.0),
+    result = calibration.calibrate(jax.random.key(3), counts, np.arange(6.0),
                                   lambda model: NUTS(model, max_tree_depth=5), data_sets=40, draws=15, thin=3,
                                   warmup=150)
-    assert {"level", "scale", "log likelihood"} == set(found.ranks)
-    assert_uniform(found, bins=4)
+    assert {"level", "scale", "log likelihood"} == set(result.ranks)
+    assert_uniform(result, bins=4)
 
 
 @pytest.mark.slow
@@ -129,12 +129,12 @@ def test_nuts_with_expectation_propagation_is_calibrated_on_few_counts():
 def test_nuts_with_expectation_propagation_is_calibrated(name, tmp_path):
     """200 data sets of 32 rows and all parameters; with LFM_SBC_OUT they are kept there, and the run goes on."""
     folder = Path(os.environ.get("LFM_SBC_OUT", tmp_path)) / name
-    found = calibration.calibrate(jax.random.key(3), FAMILIES[name], 0.5 * np.arange(32.0),
+    result = calibration.calibrate(jax.random.key(3), FAMILIES[name], 0.5 * np.arange(32.0),
                                   lambda model: NUTS(model, max_tree_depth=6), data_sets=200, draws=31, thin=10,
                                   warmup=200, batch=20, folder=folder, report=print)
-    assert {"scale", "lengthscale", "log likelihood"} < set(found.ranks)
-    assert all(len(rank) == 200 for rank in found.ranks.values())
-    assert_uniform(found, bins=16)
+    assert {"scale", "lengthscale", "log likelihood"} < set(result.ranks)
+    assert all(len(rank) == 200 for rank in result.ranks.values())
+    assert_uniform(result, bins=16)
 
 
 def densities(model, times, y, count, keywords=None, known=None, seed=0):

@@ -43,9 +43,9 @@ def test_the_densities_are_those_of_the_model_in_the_order_asked_for(bound, name
     assert float(log_likelihood) == pytest.approx(expected, rel=1e-10)
     prior = stats.norm(0.0, 0.3).logpdf(np.log(0.8)) + stats.norm(data[1]["shift"], 0.5).logpdf(np.log(1.7))
     assert float(log_prior) == pytest.approx(prior, rel=1e-10)
-    found = posterior.likelihood(z, data).model
-    np.testing.assert_allclose(found.observation.covariance, system.observation.covariance)
-    np.testing.assert_allclose(found.initial_state.mean, system.initial_state.mean)
+    result = posterior.likelihood(z, data).model
+    np.testing.assert_allclose(result.observation.covariance, system.observation.covariance)
+    np.testing.assert_allclose(result.initial_state.mean, system.initial_state.mean)
     # The medians of 15 draws are within 4 standard errors, 1.25 sd / sqrt(15), of those of the prior.
     away = {"decay": 0.0, "amount": 1.0}, {"decay": 0.3, "amount": 0.5}
     medians, sds = (np.array([of[name] for name in names]) for of in away)

@@ -47,10 +47,10 @@ def test_nuts_over_the_force_has_the_posterior_of_the_marginal_model():
     weight /= weight.sum()
     mean = weight @ decay
     sd = np.sqrt(weight @ (decay - mean) ** 2)
-    found = numpyro.diagnostics.summary({"decay": np.asarray(draws["decay"])})["decay"]
-    assert found["n_eff"] > 200
-    assert abs(found["mean"] - mean) < 4 * sd / np.sqrt(found["n_eff"])
-    assert abs(found["std"] / sd - 1) < 4 / np.sqrt(2 * found["n_eff"]) + 0.05
+    result = numpyro.diagnostics.summary({"decay": np.asarray(draws["decay"])})["decay"]
+    assert result["n_eff"] > 200
+    assert abs(result["mean"] - mean) < 4 * sd / np.sqrt(result["n_eff"])
+    assert abs(result["std"] / sd - 1) < 4 / np.sqrt(2 * result["n_eff"]) + 0.05
 
 
 @pytest.mark.slow
@@ -85,13 +85,13 @@ def test_elliptical_slice_sampling_where_the_parameters_are_fixed():
                 chain_method="vectorized", progress_bar=False)
     mcmc.run(jax.random.key(1), TIMES, Y)
     forces = np.asarray(mcmc.get_samples(group_by_chain=True)["y_forces"])[:, :, 0, ::12]
-    found = numpyro.diagnostics.summary({"u": forces})["u"]
+    result = numpyro.diagnostics.summary({"u": forces})["u"]
     model = handlers.trace(handlers.seed(fixed, 0)).get_trace(TIMES, Y)["y"]["fn"].model
     exact = lfm.smooth(model, TIMES, Y, at=np.linspace(0.0, 5.0, 6))
-    assert found["n_eff"].min() > 100
+    assert result["n_eff"].min() > 100
     mean, sd = (np.asarray(part)[:6] for part in (exact.force("u").mean, exact.force("u").sd))
-    assert np.all(np.abs(found["mean"] - mean) < 4.5 * sd / np.sqrt(found["n_eff"]) + 5e-3)
-    assert np.all(np.abs(found["std"] / sd - 1) < 4.5 / np.sqrt(2 * found["n_eff"]) + 0.02)
+    assert np.all(np.abs(result["mean"] - mean) < 4.5 * sd / np.sqrt(result["n_eff"]) + 5e-3)
+    assert np.all(np.abs(result["std"] / sd - 1) < 4.5 / np.sqrt(2 * result["n_eff"]) + 0.02)
 
 
 def test_errors():

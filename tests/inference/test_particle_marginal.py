@@ -162,13 +162,13 @@ def test_data_may_be_arguments_of_a_compiled_program():
     """One kernel, other data: with ``jit_model_args`` the chain follows the data of each run."""
     mcmc = MCMC(lfm.ParticleMarginalRAM(relaxing, particles=50), num_warmup=200, num_samples=600, num_chains=4,
                 chain_method="vectorized", progress_bar=False, jit_model_args=True)
-    found = []
+    result = []
     for y in (Y, np.sign(Y)):
         mcmc.run(jax.random.key(0), TIMES, y)
-        found.append(np.log(mcmc.get_samples(group_by_chain=True)["rate"]))
+        result.append(np.log(mcmc.get_samples(group_by_chain=True)["rate"]))
     mean, sd = exact_posterior()
-    assert abs(found[0].mean() - mean) < 5.0 * sd / np.sqrt(effective(found[0]))
-    assert abs(found[1].mean() - found[0].mean()) > 0.3 * sd
+    assert abs(result[0].mean() - mean) < 5.0 * sd / np.sqrt(effective(result[0]))
+    assert abs(result[1].mean() - result[0].mean()) > 0.3 * sd
 
 
 @pytest.mark.parametrize("wrap", [lambda d: d.mask(jnp.array(True)), lambda d: d.expand((1,)).to_event(1)],
@@ -191,11 +191,11 @@ def test_trajectories_agree_with_the_exact_smoother_wherever_they_are_wanted():
     draws = {"rate": np.full(600, 0.6)}
     exact = lfm.smooth(build(0.6), TIMES, Y, at=at)
     for times in (at, np.concatenate([at, np.linspace(4.0, 8.0, 9)])):
-        found = trajectories(jax.random.key(1), bind(relaxing, TIMES, Y), draws, times,
+        result = trajectories(jax.random.key(1), bind(relaxing, TIMES, Y), draws, times,
                              ParticleSettings(200, scheme="srk"), 10)["state"][:, :3, 0]
         sd = np.sqrt(np.asarray(exact.covariance)[:, 0, 0])
-        assert np.all(np.abs(found.mean(axis=0) - exact.mean[:, 0]) < 5.0 * sd / np.sqrt(600) + 0.02 * sd)
-        assert np.allclose(found.std(axis=0), sd, rtol=0.15)
+        assert np.all(np.abs(result.mean(axis=0) - exact.mean[:, 0]) < 5.0 * sd / np.sqrt(600) + 0.02 * sd)
+        assert np.allclose(result.std(axis=0), sd, rtol=0.15)
 
 
 @pytest.mark.parametrize("options, error, message", [

@@ -96,7 +96,7 @@ def test_gradients_equal_finite_differences(drawn):
     points = shifted.reshape(-1, size)
     assert len(points) <= len(flat)
     padded = np.concatenate([points, np.repeat(flat[:1], len(flat) - len(points), axis=0)])
-    found = np.asarray(evaluate(padded)[0])[: len(points)].reshape(len(chosen), size, 4)
-    differences = (8 * (found[..., 0] - found[..., 1]) - (found[..., 2] - found[..., 3])) / 12e-3
+    result = np.asarray(evaluate(padded)[0])[: len(points)].reshape(len(chosen), size, 4)
+    differences = (8 * (result[..., 0] - result[..., 1]) - (result[..., 2] - result[..., 3])) / 12e-3
     scale = np.abs(gradients[chosen]).max(axis=1, keepdims=True)
     np.testing.assert_array_less(np.abs(gradients[chosen] - differences) / scale, 1e-5)

@@ -38,15 +38,15 @@ def trace(fn, *arguments):
 
 def test_what_is_given_replaces_what_the_model_says():
     settings = {"rule": lfm.GaussHermite(3), "steps": 5, "max_step": 0.1, "iterations": 1}
-    found = trace(approximate(model, **settings, damping=0.5), TIMES, Y)["y"]["fn"]
-    assert {name: getattr(found, name) for name in settings} == settings
-    assert found.damping == 0.5
+    result = trace(approximate(model, **settings, damping=0.5), TIMES, Y)["y"]["fn"]
+    assert {name: getattr(result, name) for name in settings} == settings
+    assert result.damping == 0.5
 
 
 def test_what_is_not_given_stays():
-    found = trace(approximate(model, rule=None, steps=None, max_step=0.5), TIMES, Y)["y"]["fn"]
-    assert (found.steps, found.max_step) == (3, 0.5)
-    assert isinstance(found.rule, lfm.Cubature)
+    result = trace(approximate(model, rule=None, steps=None, max_step=0.5), TIMES, Y)["y"]["fn"]
+    assert (result.steps, result.max_step) == (3, 0.5)
+    assert isinstance(result.rule, lfm.Cubature)
 
 
 def test_the_density_is_that_of_a_model_written_with_the_settings():
@@ -56,15 +56,15 @@ def test_the_density_is_that_of_a_model_written_with_the_settings():
 
     changed = approximate(model, rule=lfm.Taylor(), steps=8)
     expected, _ = log_density(written, (TIMES, Y), {}, {})
-    found, _ = log_density(changed, (TIMES, Y), {}, {})
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    result, _ = log_density(changed, (TIMES, Y), {}, {})
+    np.testing.assert_allclose(result, expected, rtol=1e-12)
     plain, _ = log_density(model, (TIMES, Y), {}, {})
     assert abs(float(plain - expected)) > 1e-3
 
 
 def test_panels_take_settings_too():
-    found = trace(approximate(two, steps=9), TIMES, jnp.stack([Y, Y]))["y"]["fn"]
-    assert found.first.steps == 9
+    result = trace(approximate(two, steps=9), TIMES, jnp.stack([Y, Y]))["y"]["fn"]
+    assert result.first.steps == 9
 
 
 def test_a_model_without_the_site_and_an_unknown_setting():

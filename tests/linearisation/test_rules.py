@@ -61,10 +61,10 @@ def ids(rule):
 
 @pytest.mark.parametrize("rule", RULES, ids=ids)
 def test_linear_functions_are_exact(rule):
-    found = linearise(rule, lambda v: jnp.asarray(LINEAR) @ v + 0.7, structure((0, 1, 2, 3)))
-    assert np.allclose(found.value, LINEAR @ MEAN + 0.7, rtol=1e-13)
-    assert np.allclose(found.jacobian, LINEAR, atol=1e-12)
-    assert np.abs(found.residual_cov).max() < 1e-12
+    result = linearise(rule, lambda v: jnp.asarray(LINEAR) @ v + 0.7, structure((0, 1, 2, 3)))
+    assert np.allclose(result.value, LINEAR @ MEAN + 0.7, rtol=1e-13)
+    assert np.allclose(result.jacobian, LINEAR, atol=1e-12)
+    assert np.abs(result.residual_cov).max() < 1e-12
 
 
 def cubic(v):
@@ -81,8 +81,8 @@ def test_expectations_to_degree_three(rule):
     """E f of cubic functions, and A of quadratic ones, which take products of degree three."""
     everything = structure((0, 1, 2, 3))
     assert np.allclose(linearise(rule, cubic, everything).value, exact(cubic)[0], rtol=1e-12)
-    found, (mean, slope, _) = linearise(rule, quadratic, everything), exact(quadratic)
-    assert np.allclose(found.value, mean, rtol=1e-12) and np.allclose(found.jacobian, slope, rtol=1e-11, atol=1e-12)
+    result, (mean, slope, _) = linearise(rule, quadratic, everything), exact(quadratic)
+    assert np.allclose(result.value, mean, rtol=1e-12) and np.allclose(result.jacobian, slope, rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("order", [3, 5])
@@ -90,16 +90,16 @@ def test_gauss_hermite_within_its_degree(order):
     """Degree 2 order - 1 in each input: A and Omega of a function of degree (order - 1) are exact."""
     power = order - 1
     function = lambda v: jnp.stack([(v[0] + v[1]) ** power, v[3] ** power - v[0]])  # noqa: E731
-    found = linearise(lfm.GaussHermite(order), function, structure((0, 1, 2, 3)))
-    for one, other in zip((found.value, found.jacobian, found.residual_cov), exact(function), strict=True):
+    result = linearise(lfm.GaussHermite(order), function, structure((0, 1, 2, 3)))
+    for one, other in zip((result.value, result.jacobian, result.residual_cov), exact(function), strict=True):
         assert np.allclose(one, other, rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize("rule", SIGMA, ids=ids)
 def test_residual_covariance_is_semidefinite(rule):
     function = lambda v: jnp.stack([jnp.sin(v[0]) * v[1], jnp.exp(0.5 * v[2]) + v[3] ** 2])  # noqa: E731
-    found = linearise(rule, function, structure((0, 1, 2, 3)))
-    eigenvalues = np.linalg.eigvalsh(found.residual_cov)
+    result = linearise(rule, function, structure((0, 1, 2, 3)))
+    eigenvalues = np.linalg.eigvalsh(result.residual_cov)
     assert eigenvalues[0] >= -1e-13 * eigenvalues[-1]
 
 
@@ -107,8 +107,8 @@ def test_residual_covariance_is_semidefinite(rule):
 def test_averaged_coordinates_are_exact(rule):
     """R(r, v) u: points in r and v alone give all moments, those of u by conditioning."""
     function = lambda v: jnp.stack([v[0] * v[2] + v[1] * v[3], (1.0 + v[1]) * v[2] - 0.3 * v[3]])  # noqa: E731
-    found = linearise(rule, function, structure((0, 1), (2, 3)))
-    for one, other in zip((found.value, found.jacobian, found.residual_cov), exact(function), strict=True):
+    result = linearise(rule, function, structure((0, 1), (2, 3)))
+    for one, other in zip((result.value, result.jacobian, result.residual_cov), exact(function), strict=True):
         assert np.allclose(one, other, rtol=1e-10, atol=1e-11)
 
 
@@ -116,10 +116,10 @@ def test_constant_coordinates_follow_by_linearity():
     """0.5 v3 enters linearly: its slope is given, and the points lie in v0 alone."""
     function = lambda v: jnp.stack([v[0] ** 2 * (1 + v[1]) + 0.5 * v[3], v[0] - 2.0 * v[2]])  # noqa: E731
     given = jnp.zeros((2, 4)).at[0, 3].set(0.5).at[1, 2].set(-2.0)
-    found = linearise(lfm.GaussHermite(4), function, structure((0,), (1,), (2, 3)), given)
+    result = linearise(lfm.GaussHermite(4), function, structure((0,), (1,), (2, 3)), given)
     mean, slope, residual = exact(function)
-    assert np.allclose(found.value, mean, rtol=1e-11) and np.allclose(found.jacobian, slope, rtol=1e-10, atol=1e-11)
-    assert np.allclose(found.residual_cov, residual, rtol=1e-10, atol=1e-11)
+    assert np.allclose(result.value, mean, rtol=1e-11) and np.allclose(result.jacobian, slope, rtol=1e-10, atol=1e-11)
+    assert np.allclose(result.residual_cov, residual, rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize("rule", SIGMA, ids=ids)
@@ -128,13 +128,13 @@ def test_without_variance_the_slope_is_the_jacobian(rule, known):
     keep = np.array([i not in known for i in range(4)])
     covariance = COVARIANCE * keep[:, None] * keep
     function = lambda v: jnp.stack([jnp.sin(v[0]) + v[1] ** 3 + v[2], jnp.exp(v[3]) - v[2]])  # noqa: E731
-    found = linearise(rule, function, structure((0, 1, 2, 3)), covariance=covariance)
+    result = linearise(rule, function, structure((0, 1, 2, 3)), covariance=covariance)
     jacobian = np.asarray(jax.jacfwd(function)(jnp.asarray(MEAN)))
-    assert np.isfinite(found.jacobian).all()
-    assert np.allclose(found.jacobian[:, list(known)], jacobian[:, list(known)], atol=1e-7)
+    assert np.isfinite(result.jacobian).all()
+    assert np.allclose(result.jacobian[:, list(known)], jacobian[:, list(known)], atol=1e-7)
     gradient = jax.jacrev(lambda scale: linearise(rule, lambda v: scale * function(v), structure((0, 1, 2, 3)),
                                                   covariance=covariance).jacobian)(1.0)
-    assert np.allclose(gradient, found.jacobian, atol=1e-8)
+    assert np.allclose(gradient, result.jacobian, atol=1e-8)
 
 
 @pytest.mark.parametrize("rule", SIGMA, ids=ids)
@@ -155,21 +155,23 @@ def test_central_differences_are_stirlings_formula():
     mean = MEAN[:2]
     inputs = Inputs(jnp.asarray(mean), jnp.asarray(root @ root.T), 1e-6 * jnp.ones(2))
     where = InputStructure((0, 1), (), (), ((True, True),), True)
-    found = lfm.CentralDifference(h).linearise(lambda v: (f(v), ()), inputs, where, jnp.zeros((2, 2)))
+    result = lfm.CentralDifference(h).linearise(lambda v: (f(v), ()), inputs, where, jnp.zeros((2, 2)))
     plus, minus = (np.stack([f(mean + sign * h * column) for column in root.T]) for sign in (1, -1))
     centre = np.asarray(f(mean))
     expected = (h**2 - 2) / h**2 * centre + (plus + minus).sum(0) / (2 * h**2)
     first, second = plus - minus, plus + minus - 2 * centre
     covariance = first.T @ first / (4 * h**2) + (h**2 - 1) / (4 * h**4) * second.T @ second
-    assert np.allclose(found.value, expected, rtol=1e-12)
-    assert np.allclose(found.residual_cov + found.jacobian @ root @ root.T @ found.jacobian.T, covariance, rtol=1e-12)
+    assert np.allclose(result.value, expected, rtol=1e-12)
+    assert np.allclose(
+        result.residual_cov + result.jacobian @ root @ root.T @ result.jacobian.T, covariance, rtol=1e-12
+    )
 
 
 def test_taylor_is_value_and_jacobian():
-    found = linearise(lfm.Taylor(), cubic, structure((0, 1), (2,), (3,)), jnp.zeros((2, 4)).at[0, 3].set(1.0).at[
+    result = linearise(lfm.Taylor(), cubic, structure((0, 1), (2,), (3,)), jnp.zeros((2, 4)).at[0, 3].set(1.0).at[
         1, 3].set(MEAN[1] ** 2))
-    assert np.allclose(found.jacobian, jax.jacfwd(cubic)(jnp.asarray(MEAN)), rtol=1e-13)
-    assert np.allclose(found.value, cubic(MEAN)) and not found.residual_cov.any()
+    assert np.allclose(result.jacobian, jax.jacfwd(cubic)(jnp.asarray(MEAN)), rtol=1e-13)
+    assert np.allclose(result.value, cubic(MEAN)) and not result.residual_cov.any()
 
 
 @pytest.mark.parametrize("make, message", [

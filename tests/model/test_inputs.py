@@ -18,13 +18,13 @@ GRID = np.array([-1.0, 0.5, 0.7, 1.0, 2.999, 3.0, 9.0])
 
 
 def test_linear():
-    found = jax.vmap(lfm.Input(TIMES, VALUES, "linear"))(GRID)
-    assert np.allclose(found, np.stack([np.interp(GRID, TIMES, column) for column in VALUES.T], axis=1), atol=1e-15)
+    result = jax.vmap(lfm.Input(TIMES, VALUES, "linear"))(GRID)
+    assert np.allclose(result, np.stack([np.interp(GRID, TIMES, column) for column in VALUES.T], axis=1), atol=1e-15)
 
 
 def test_previous():
-    found = jax.vmap(lfm.Input(TIMES, VALUES))(GRID)
-    assert np.array_equal(found, VALUES[[0, 0, 0, 1, 1, 2, 2]])
+    result = jax.vmap(lfm.Input(TIMES, VALUES))(GRID)
+    assert np.array_equal(result, VALUES[[0, 0, 0, 1, 1, 2, 2]])
     assert float(lfm.Input([1.0], [3.0], "linear")(5.0)) == 3.0
 
 
@@ -44,13 +44,13 @@ def pushed(dynamics):
 
 def response(function):
     """The solution at the rows, integrated from jump to jump."""
-    state, found = 0.0, [0.0]
+    state, result = 0.0, [0.0]
     for begin, value in enumerate([0.0, 5.0, 1.0]):
         span = (begin, begin + 1.0)
         solution = solve_ivp(lambda t, x, v=value: function(x, v), span, [state], rtol=1e-12, atol=1e-13)
         state = solution.y[0, -1]
-        found.append(state)
-    return np.array(found)
+        result.append(state)
+    return np.array(result)
 
 
 def predictions(model, steps):
@@ -58,9 +58,9 @@ def predictions(model, steps):
 
 
 def test_jumps_at_rows_are_exact_in_a_linear_model():
-    found = predictions(pushed(lambda x, u, t: STEP(t) - x), 10)
-    assert np.allclose(found, response(lambda x, v: v - x), atol=1e-6)
-    assert found[1] == 0.0, "nothing moves before the jump"
+    result = predictions(pushed(lambda x, u, t: STEP(t) - x), 10)
+    assert np.allclose(result, response(lambda x, v: v - x), atol=1e-6)
+    assert result[1] == 0.0, "nothing moves before the jump"
 
 
 def test_jumps_at_rows_keep_the_order_four():
@@ -146,8 +146,8 @@ OBSERVATION = lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1]))
 ])
 def test_what_is_beyond(dynamics, options, message):
     """A value that holds until the next time may do so after the last for as long as before; delays count."""
-    found = told(pushed(dynamics), **options)
-    assert (message is None and not found) or message in found[0]
+    result = told(pushed(dynamics), **options)
+    assert (message is None and not result) or message in result[0]
 
 
 def test_reading_beyond_may_be_an_error():

@@ -183,16 +183,16 @@ def test_a_particle_filter_weighs_with_the_family():
     """One observation of a known predictor: the estimate is its probability."""
     known = lfm.LatentForceModel(lambda x, u, t: -x, {}, lfm.PoissonObservation(state),
                                  lfm.Gaussian(jnp.array([0.7]), jnp.zeros((1, 1))))
-    found = lfm.particle_filter(jax.random.key(0), known, [0.0], [[3.0]], particles=10)
-    assert found.log_likelihood[0] == pytest.approx(stats.poisson.logpmf(3, np.exp(0.7)), abs=1e-12)
+    result = lfm.particle_filter(jax.random.key(0), known, [0.0], [[3.0]], particles=10)
+    assert result.log_likelihood[0] == pytest.approx(stats.poisson.logpmf(3, np.exp(0.7)), abs=1e-12)
     filtered = lfm.filter(known, [0.0], [[3.0]]).log_likelihood[0]
-    assert filtered == pytest.approx(float(found.log_likelihood[0]), abs=1e-7)
+    assert filtered == pytest.approx(float(result.log_likelihood[0]), abs=1e-7)
 
 
 def test_probabilities_outside_of_the_unit_interval_have_no_density():
     family = lfm.BernoulliObservation(lambda x, u, t: x, link="identity")
-    found = family.log_prob(jnp.array([-3.0, 0.25, 1.5]), jnp.array([0.0, 1.0, 1.0]))
-    np.testing.assert_allclose(found, [-np.inf, np.log(0.25), -np.inf])
+    result = family.log_prob(jnp.array([-3.0, 0.25, 1.5]), jnp.array([0.0, 1.0, 1.0]))
+    np.testing.assert_allclose(result, [-np.inf, np.log(0.25), -np.inf])
 
 
 def test_limits_of_rounded_values_leave_nothing_out():
@@ -205,11 +205,11 @@ def test_limits_of_rounded_values_leave_nothing_out():
 @pytest.mark.parametrize("concentration", [3.0, 1e4, 1e12, 1e15])
 def test_a_large_concentration_is_a_poisson(concentration):
     family = lfm.NegativeBinomialObservation(lambda x, u, t: x, concentration)
-    found = float(family.log_prob(jnp.array([0.5]), jnp.array([3.0]))[0])
+    result = float(family.log_prob(jnp.array([0.5]), jnp.array([3.0]))[0])
     mean = np.exp(0.5)
     expected = stats.nbinom.logpmf(3, concentration, concentration / (concentration + mean)) \
         if concentration < 1e6 else stats.poisson.logpmf(3, mean)
-    assert found == pytest.approx(expected, abs=1e-8)
+    assert result == pytest.approx(expected, abs=1e-8)
 
 
 def test_a_panel_checks_the_data_of_a_family():

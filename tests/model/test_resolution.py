@@ -46,11 +46,11 @@ def test_estimate_is_the_true_error(order):
                 for sd in (0.001, 0.03, 1.0):
                     force = lfm.SquaredExponential(1.0, ell, order)
                     true = true_error(force, times, sd)
-                    (found,) = resolutions(model(force, sd), times)
+                    (result,) = resolutions(model(force, sd), times)
                     if true > 1.6 * TOLERANCE:
-                        assert found.error > TOLERANCE
+                        assert result.error > TOLERANCE
                     if true < TOLERANCE / 1.6:
-                        assert found.error < TOLERANCE
+                        assert result.error < TOLERANCE
 
 
 def test_the_error_is_estimated_through_the_dynamics():
@@ -96,13 +96,13 @@ def test_silent_inside_compiled_code_and_for_other_forces():
 def test_terms_of_sums_and_odd_cases():
     times = np.linspace(0.0, 1.0, 50)
     both = lfm.SquaredExponential(1.0, 0.2, 2) + lfm.Matern(1.0, 0.1, 0) + lfm.Constant(1.0)
-    (found,) = resolutions(model(both, 0.01), times)
+    (result,) = resolutions(model(both, 0.01), times)
     (alone,) = resolutions(model(lfm.SquaredExponential(1.0, 0.2, 2), 0.01), times)
-    assert TOLERANCE < found.error < alone.error  # a rough force hides the difference
+    assert TOLERANCE < result.error < alone.error  # a rough force hides the difference
     assert resolutions(model(lfm.SquaredExponential(1.0, 0.2), 0.1), times[:1]) == []
     for at in (np.zeros(3), 1e6 * times, 1e-9 * times):
-        (found,) = resolutions(model(lfm.SquaredExponential(1.0, 0.2), 0.1), at)
-        assert found.error < TOLERANCE
+        (result,) = resolutions(model(lfm.SquaredExponential(1.0, 0.2), 0.1), at)
+        assert result.error < TOLERANCE
     # Without noise nothing can be trusted, and a model that overflows is passed over.
     assert resolutions(model(lfm.SquaredExponential(1.0, 0.1), 1e-12), np.linspace(0, 1, 200))[0].error > TOLERANCE
     unstable = model(lfm.SquaredExponential(1.0, 1.0), 0.1, lambda x, u, t: x, lambda x, u, t: u + 1e5 * x)

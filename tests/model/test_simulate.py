@@ -38,14 +38,14 @@ def within_monte_carlo_error(sample, mean, covariance):
 
 def test_linear_model_has_its_exact_moments(linear):
     """State and force at all times, and y, which adds independent noise to replicates."""
-    found, (mean, cov) = linear
+    result, (mean, cov) = linear
     keep = [0, 2, 3]
-    sample = np.concatenate([found.state[:, keep, 0], found.forces["u"][:, keep]], axis=1)
+    sample = np.concatenate([result.state[:, keep, 0], result.forces["u"][:, keep]], axis=1)
     order = [(k, w) for w in (0, 1) for k in keep]
     covariance = np.array([[cov[a, b, v, w] for b, w in order] for a, v in order])
     within_monte_carlo_error(sample, np.array([mean[k, w] for k, w in order]), covariance)
-    within_monte_carlo_error(np.asarray(found.y[:, :, 0]), mean[:, 0], cov[:, :, 0, 0] + 0.09 * np.eye(4))
-    assert np.array_equal(found.state[:, 0], found.state[:, 1]) and not np.array_equal(found.y[:, 0], found.y[:, 1])
+    within_monte_carlo_error(np.asarray(result.y[:, :, 0]), mean[:, 0], cov[:, :, 0, 0] + 0.09 * np.eye(4))
+    assert np.array_equal(result.state[:, 0], result.state[:, 1]) and not np.array_equal(result.y[:, 0], result.y[:, 1])
 
 
 def test_noise_free_motion_converges_with_the_steps():
@@ -85,9 +85,9 @@ def test_state_dependent_dispersion_is_ito():
 
 
 def test_starts_at_the_initial_time_and_covers_equal_times():
-    found = lfm.simulate(jax.random.key(0), motif(softplus, variance=0.0), [0.0, 0.0, 1.0])
-    assert np.allclose(found.state[0], 0.3 / (0.8 * np.array([1.0, 1.5]))) and np.array_equal(*found.state[:2])
-    assert found.y.shape == (3, 2) and found.forces["u"].shape == (3,)
+    result = lfm.simulate(jax.random.key(0), motif(softplus, variance=0.0), [0.0, 0.0, 1.0])
+    assert np.allclose(result.state[0], 0.3 / (0.8 * np.array([1.0, 1.5]))) and np.array_equal(*result.state[:2])
+    assert result.y.shape == (3, 2) and result.forces["u"].shape == (3,)
 
 
 def test_a_jump_at_a_row_is_never_lost():

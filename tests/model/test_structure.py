@@ -19,9 +19,9 @@ def structure(dynamics, size, forces=("u",), **options):
     model = lfm.LatentForceModel(
         dynamics, {name: M(1.0, 1.0) for name in forces}, lfm.GaussianObservation(whole_state, jnp.ones(size)),
         lfm.Gaussian(jnp.ones(size), jnp.eye(size)), **options)
-    found = lfm.state_space(model).drift_structure
+    result = lfm.state_space(model).drift_structure
     names = (*model.state_names, *model.force_names)
-    return ({names[i] for i in found.points}, {names[i] for i in found.averaged}, {names[i] for i in found.constant})
+    return ({names[i] for i in result.points}, {names[i] for i in result.averaged}, {names[i] for i in result.constant})
 
 
 def ballistic(x, u, t):
@@ -34,8 +34,8 @@ def ballistic(x, u, t):
 
 
 def test_transcription():
-    found = structure(Motif(jnp.array([0.8, 1.0, 1.3]), jnp.ones(3), 0.1, softplus), 3)
-    assert found == ({"u"}, set(), {"x0", "x1", "x2"})
+    result = structure(Motif(jnp.array([0.8, 1.0, 1.3]), jnp.ones(3), 0.1, softplus), 3)
+    assert result == ({"u"}, set(), {"x0", "x1", "x2"})
 
 
 def test_linear_motif_and_spring():
@@ -78,9 +78,9 @@ def test_ballistic():
     (lambda x, u, t: lfm.Input([0.0, 1.0], [0.0, 1.0])(t) + u - x, set(), set()),
 ])
 def test_primitives(function, points, averaged):
-    found = structure(function, 1)
+    result = structure(function, 1)
     if points is not None:
-        assert found[:2] == (points, averaged)
+        assert result[:2] == (points, averaged)
 
 
 def numeric_hessian(function, size, seed):
@@ -129,13 +129,13 @@ def numeric_hessian(function, size, seed):
     lambda v: jax.grad(lambda w: (w[0] ** 2 * w[1]).sum())(v),
 ])
 def test_never_smaller_than_the_hessian(function):
-    found = pattern(function, 4)
+    result = pattern(function, 4)
     true = numeric_hessian(function, 4, 0)
-    assert not (true & ~found.hessian).any()
-    assert np.array_equal(found.hessian, found.hessian.T)
+    assert not (true & ~result.hessian).any()
+    assert np.array_equal(result.hessian, result.hessian.T)
     jacobian = np.max([np.abs(np.asarray(jax.jacfwd(function)(jnp.asarray(v)))) for v in
                        np.random.default_rng(1).normal(size=(4, 4))], axis=0) > 1e-12
-    assert not (jacobian & ~found.jacobian).any()
+    assert not (jacobian & ~result.jacobian).any()
 
 
 def test_custom_rules_are_seen_through_or_taken_as_non_linear():
@@ -153,8 +153,8 @@ def test_custom_rules_are_seen_through_or_taken_as_non_linear():
     callback = lambda v: jax.pure_callback(  # noqa: E731
         lambda a: np.sin(a), jax.ShapeDtypeStruct((2,), float), v)
     for function in (cube, square, callback):
-        found = pattern(lambda v, f=function: f(v[:2]) + v[2:], 4).hessian
-        assert found[0, 0] and found[1, 1] and not found[2:].any()
+        result = pattern(lambda v, f=function: f(v[:2]) + v[2:], 4).hessian
+        assert result[0, 0] and result[1, 1] and not result[2:].any()
 
 
 def test_under_transformations():
@@ -167,7 +167,7 @@ def test_under_transformations():
     seen = []
     jax.jit(total)(1.0), jax.grad(total)(1.0), jax.vmap(total)(jnp.ones(2))
     jax.jit(jax.grad(total))(1.0)
-    assert len(seen) == 4 and all(found == ({"u"}, set(), {"x0"}) for found in seen)
+    assert len(seen) == 4 and all(result == ({"u"}, set(), {"x0"}) for result in seen)
 
 
 class Network(eqx.Module):
@@ -183,8 +183,8 @@ def test_a_neural_network():
 
 
 def test_declared_inputs_override():
-    found = structure(Motif(jnp.ones(1), jnp.ones(1), 0.1, softplus), 1, nonlinear_inputs=("x0", "u"))
-    assert found[0] == {"x0", "u"}
+    result = structure(Motif(jnp.ones(1), jnp.ones(1), 0.1, softplus), 1, nonlinear_inputs=("x0", "u"))
+    assert result[0] == {"x0", "u"}
     # Of a product either factor will do.
     assert structure(lambda x, u, t: x * u, 1, nonlinear_inputs=("u",))[:2] == ({"u"}, {"x0"})
 

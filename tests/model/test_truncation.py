@@ -66,15 +66,15 @@ def test_the_estimate_is_the_error_of_dense_algebra(name):
     evolution, kernel = EVOLUTIONS[name]
     for times in (WEEKLY[:300], WEEKLY, IRREGULAR):
         for functions, sd in ((5, 1.0), (7, 0.2), (9, 0.2)):
-            (found,) = truncations(model(lfm.QuasiPeriodic(YEARLY, evolution, functions), sd), times)
+            (result,) = truncations(model(lfm.QuasiPeriodic(YEARLY, evolution, functions), sd), times)
             dense = error(*covariances(times, functions, kernel, sd))
-            if times.size <= 300 and max(dense, found.error) > TOLERANCE:
-                np.testing.assert_allclose(found.error, dense, rtol=1e-5)  # every row is looked at
-            assert dense < 1.7 * TOLERANCE or dense / 1.7 < found.error < 1.7 * dense
-            assert dense > TOLERANCE / 1.7 or found.error < TOLERANCE
-            if found.error > TOLERANCE:  # as many as are recommended do, and fewer would not
-                assert error(*covariances(times, found.functions, kernel, sd)) < 1.7 * TOLERANCE
-                assert error(*covariances(times, found.functions - 2, kernel, sd)) > TOLERANCE / 1.7
+            if times.size <= 300 and max(dense, result.error) > TOLERANCE:
+                np.testing.assert_allclose(result.error, dense, rtol=1e-5)  # every row is looked at
+            assert dense < 1.7 * TOLERANCE or dense / 1.7 < result.error < 1.7 * dense
+            assert dense > TOLERANCE / 1.7 or result.error < TOLERANCE
+            if result.error > TOLERANCE:  # as many as are recommended do, and fewer would not
+                assert error(*covariances(times, result.functions, kernel, sd)) < 1.7 * TOLERANCE
+                assert error(*covariances(times, result.functions - 2, kernel, sd)) > TOLERANCE / 1.7
 
 
 def test_the_loss_of_a_trend_and_a_season():
@@ -88,16 +88,16 @@ def test_the_loss_of_a_trend_and_a_season():
     y = roots[0] @ np.random.default_rng(0).standard_normal((WEEKLY.size, 100))
     exact, truncated = (-0.5 * (solve_triangular(root, y, lower=True) ** 2).sum(0) - np.log(root.diagonal()).sum()
                         - 0.5 * WEEKLY.size * np.log(2 * np.pi) for root in roots)
-    (found,) = truncations(model(season, 0.3, trend), WEEKLY)
+    (result,) = truncations(model(season, 0.3, trend), WEEKLY)
     lost = exact - truncated
     assert lost.mean() > 1.0
-    assert (np.abs(lost) < found.error).mean() >= 0.93 and np.abs(lost).max() > 0.5 * found.error
+    assert (np.abs(lost) < result.error).mean() >= 0.93 and np.abs(lost).max() > 0.5 * result.error
     with pytest.warns(lfm.ApproximationWarning, match=r"the 7 functions .*'season'.*Use functions=(11|13), or expl"):
         of_filter = lfm.MarginalLikelihood(model(season, 0.3, trend), WEEKLY).log_prob(y[:, 0, None])
     np.testing.assert_allclose(of_filter, truncated[0], atol=1e-3)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        enough = lfm.QuasiPeriodic(YEARLY, evolution, found.functions)
+        enough = lfm.QuasiPeriodic(YEARLY, evolution, result.functions)
         of_filter = lfm.MarginalLikelihood(model(enough, 0.3, trend), WEEKLY).log_prob(y[:, 0, None])
     np.testing.assert_allclose(of_filter, exact[0], atol=TOLERANCE)
 
@@ -119,8 +119,8 @@ def test_the_error_is_estimated_through_the_dynamics():
         lambda x, u, t: 6.0 * (u - x), {"season": lfm.QuasiPeriodic(YEARLY, lfm.Matern(1.0, 10.0, 1), functions)},
         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([sd**2])),
         lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))))
-    (found,) = truncations(filtered, times)
-    np.testing.assert_allclose(found.error, error(exact, truncated), rtol=accuracy)
+    (result,) = truncations(filtered, times)
+    np.testing.assert_allclose(result.error, error(exact, truncated), rtol=accuracy)
 
 
 def test_kernels_without_a_spectrum_and_weights_that_jump():
@@ -133,9 +133,9 @@ def test_kernels_without_a_spectrum_and_weights_that_jump():
         noise = 0.1**2 * np.eye(times.size)
         dense = error(np.asarray(kernel(*lag)) * weights + noise,
                       np.asarray(season.basis.covariance(*lag)) * weights + noise)
-        (found,) = truncations(model(season, 0.1), times)
-        np.testing.assert_allclose(found.error, dense, rtol=1e-4)
-        assert 9 < found.functions < 40
+        (result,) = truncations(model(season, 0.1), times)
+        np.testing.assert_allclose(result.error, dense, rtol=1e-4)
+        assert 9 < result.functions < 40
 
 
 def test_silent_where_nothing_is_wrong_or_nothing_can_be_told():

@@ -57,8 +57,8 @@ def likelihoods():
 
     def run(bearing, y):
         system = own.build(**own.TRUTH, bearing=bearing)
-        found = lfm.smooth(system, data.times, y, steps=1, max_step=own.LONGEST_STEP)
-        return found.log_likelihood.sum(), found.mean
+        result = lfm.smooth(system, data.times, y, steps=1, max_step=own.LONGEST_STEP)
+        return result.log_likelihood.sum(), result.mean
 
     return data, jax.jit(run)
 
@@ -78,8 +78,8 @@ def test_turning_the_radar_changes_nothing(likelihoods, bearing):
     if bearing == np.pi:
         assert np.abs(np.diff(turned[:, 1])).max() < 0.1
     expected, mean = run(0.0, data.y)
-    found, other = run(bearing, turned)
-    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    result, other = run(bearing, turned)
+    np.testing.assert_allclose(result, expected, rtol=1e-8)
     np.testing.assert_allclose(other, mean, rtol=1e-6, atol=1e-6)
 
 

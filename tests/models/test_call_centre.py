@@ -38,14 +38,14 @@ def test_a_known_rate_gives_a_known_queue():
     system = lfm.LatentForceModel(system.dynamics, system.forces, system.observation,
                                   lfm.Gaussian(jnp.log1p(jnp.ones(1)), jnp.zeros(1)))
     times = np.arange(0.0, 601.0, 20.0)
-    found = lfm.filter(system, times, np.where(times[:, None] == 0.0, np.log(2.0), np.nan), steps=100)
+    result = lfm.filter(system, times, np.where(times[:, None] == 0.0, np.log(2.0), np.nan), steps=100)
     path = [1.0]
     for begin in times[:-1]:
         omega = 10.0 if begin < 300.0 else 5.0
         one = integrate.solve_ivp(lambda t, x: 7.0 - omega * x / (1 + x), (0, 20.0), path[-1:],  # noqa: B023
                                   rtol=1e-10, atol=1e-10)
         path.append(one.y[0, -1])
-    np.testing.assert_allclose(np.expm1(found.predicted_mean[:, 0]), path, rtol=1e-4)
+    np.testing.assert_allclose(np.expm1(result.predicted_mean[:, 0]), path, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("force", "variance"), [("cqm", 1.0), ("wqm", 1.2), ("periodic", 1.0), ("matern", 1.0),
@@ -55,14 +55,14 @@ def test_every_force_has_the_covariance_that_is_said(force, variance):
     m = own()
     values = {"mean": 6.0, "scale": 2.0, "lengthscale": 400.0, "memory": 10.0}
     values |= dict.fromkeys(set(values) - set(m.names(force)))
-    found = m.arrivals(force, **values, period=840.0, functions=41 if force != "resonator" else 3, cycles=4)
-    assert found.mean_at(0.0) == 6.0
+    result = m.arrivals(force, **values, period=840.0, functions=41 if force != "resonator" else 3, cycles=4)
+    assert result.mean_at(0.0) == 6.0
     late, early = 1800.0, 120.0
     expected = {"cqm": np.exp(-0.2), "wqm": 1.0, "periodic": 1.0, "matern": np.exp(-4.2), "resonator": 2.0}[force]
     spread = {"resonator": 2.0 + late / 8400.0 / 2.0}.get(force, variance)
-    assert found.covariance(late, late) / 4.0 == pytest.approx(spread, abs=0.05)
-    assert found.covariance(late, early) / 4.0 == pytest.approx(expected, abs=0.05)
-    assert len(found.jump_times) == (3 if force == "wqm" else 0)
+    assert result.covariance(late, late) / 4.0 == pytest.approx(spread, abs=0.05)
+    assert result.covariance(late, early) / 4.0 == pytest.approx(expected, abs=0.05)
+    assert len(result.jump_times) == (3 if force == "wqm" else 0)
 
 
 def test_steps_of_two_minutes_are_short_enough():

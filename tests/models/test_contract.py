@@ -93,13 +93,13 @@ def test_default_data_depend_on_the_seed_alone(name):
 def test_sites_are_those_that_the_file_documents(name, options):
     file = loading.load(name)
     data = simulated(name, *options.items())
-    found = sites(file, data, options)
-    sampled = [key for key, site in found.items() if site["type"] == "sample" and not site["is_observed"]]
+    result = sites(file, data, options)
+    sampled = [key for key, site in result.items() if site["type"] == "sample" and not site["is_observed"]]
     assert sampled == list(file.parameters)
     for key in sampled:
         value = np.asarray(data.truth["parameters"][key])
-        assert value.shape == found[key]["fn"].shape(), key
-        assert np.all(found[key]["fn"].support(value)), f"the true {key} is possible"
+        assert value.shape == result[key]["fn"].shape(), key
+        assert np.all(result[key]["fn"].support(value)), f"the true {key} is possible"
 
 
 @pytest.mark.parametrize(("name", "options"), CASES)

@@ -45,8 +45,8 @@ def test_dynamics_are_those_of_the_sir_model(functions):
     np.testing.assert_allclose(np.exp(ours.y[:, -1]), sir.y[:, -1], rtol=1e-6)
     # What is reported of the new infections beta s i N of a day.
     expected = np.log(0.5 * 100_000 * 0.5 * sir.y[0, -1] * sir.y[1, -1])
-    found = system.observation.function(jnp.asarray(ours.y[:, -1]), jnp.zeros(1), 60.0)
-    assert float(found[0]) == pytest.approx(expected, abs=1e-6)
+    result = system.observation.function(jnp.asarray(ours.y[:, -1]), jnp.zeros(1), 60.0)
+    assert float(result[0]) == pytest.approx(expected, abs=1e-6)
 
 
 def test_known_rates_are_fixed_unless_freed(file):
@@ -72,16 +72,16 @@ def test_the_posterior_covers_the_truth(file, functions, simulated):
         y = np.asarray(drawn.y)
         objective = posterior.objective(y)
         mode = newton(objective, quasi_newton(objective, np.log(np.array([2.0, 0.3, 15.0, 10.0]))).point)
-        found = weighted_posterior(posterior, y, [mode], 300, index)
-        share = found.weight
-        pareto.append(float(found.weights.k))
-        rank = float(share @ (found.draws[:, 0] < np.log(theta[0])))
+        result = weighted_posterior(posterior, y, [mode], 300, index)
+        share = result.weight
+        pareto.append(float(result.weights.k))
+        rank = float(share @ (result.draws[:, 0] < np.log(theta[0])))
         ranks.append(rank)
         of_r0.append(0.025 < rank < 0.975)
         chosen = np.random.default_rng(index).choice(len(share), 40, p=share / share.sum())
-        moments = [smooth(found.draws[one], y) for one in chosen]
+        moments = [smooth(result.draws[one], y) for one in chosen]
         # log beta less the logarithm of the known rate of recovery
-        mean = np.array([np.asarray(m) + found.draws[one, 0] for one, (m, _) in zip(chosen, moments, strict=True)])
+        mean = np.array([np.asarray(m) + result.draws[one, 0] for one, (m, _) in zip(chosen, moments, strict=True)])
         sd = np.array([np.asarray(s) for _, s in moments])
         mean, sd = scores.total_moments(mean, sd**2)
         truth = np.asarray(drawn.forces[functions["FORCE"]]) + np.log(theta[0])

@@ -39,7 +39,7 @@ def shifts(file, data, noise_sd, df, places, known=None):
     keywords = file.keywords(data, {"df": df})
     bound = bind(file.model, data.times, data.y, **keywords).fix(file.anchors(data) | (known or {}))
     start = bound.draw(jax.random.key(0))
-    found = []
+    result = []
     for place in range(places):
         rng = np.random.default_rng(place)
         spoilt = np.zeros(data.y.size, bool)
@@ -54,9 +54,9 @@ def shifts(file, data, noise_sd, df, places, known=None):
         without, with_errors = fits
         assert max(without.decrement, with_errors.decrement) < 1e-8
         sd = np.sqrt(np.diag(without.curvature.factor @ without.curvature.factor.T))
-        found.append((with_errors.point - without.point) / sd)
+        result.append((with_errors.point - without.point) / sd)
     noise = np.array([name.startswith("noise_sd") for name in bound.names])
-    moved = np.array(found)
+    moved = np.array(result)
     rates, scales = moved[:, ~noise], moved[:, noise]
     print(f"df = {df:g}: largest {np.abs(rates).max(1).round(3)}, root mean square",
           np.sqrt((rates**2).mean(1)).round(3), "noise", np.abs(scales).max(1, initial=0).round(2))

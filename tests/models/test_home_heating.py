@@ -31,7 +31,7 @@ def test_the_expected_temperatures_solve_the_equations(envelope):
     model = system(residual="none", envelope=envelope)
     y = np.full((13, 2), np.nan)
     y[0] = [18.0, 4.0]  # what is expected at the start
-    found = np.asarray(lfm.filter(model, TIMES, y, steps=5).predicted_mean)
+    result = np.asarray(lfm.filter(model, TIMES, y, steps=5).predicted_mean)
 
     def slope(t, x):
         heater = HEATER[min(int(t), 12)]
@@ -43,7 +43,7 @@ def test_the_expected_temperatures_solve_the_equations(envelope):
     state = np.array([18.0, 15.0][:size])
     for hour in range(12):
         state = solve_ivp(slope, (hour, hour + 1 - 1e-9), state, rtol=1e-10, atol=1e-10).y[:, -1]
-        np.testing.assert_allclose(found[hour + 1, :size], state, rtol=1e-6)
+        np.testing.assert_allclose(result[hour + 1, :size], state, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("residual", "states", "jumps"), [
@@ -70,11 +70,11 @@ def test_the_outdoor_process_is_read_off_its_measurements():
     outdoor = 6.0 + root @ np.random.default_rng(0).normal(size=len(times))
     outdoor[100:110] = np.nan
     data = lfm.Data(times, np.column_stack([outdoor, outdoor]), FILE.outputs)
-    found = FILE.anchors(data)
+    result = FILE.anchors(data)
     # 600 hours hold some 30 independent values.
-    assert found["outdoor_mean"] == pytest.approx(6.0, abs=4 * 3.0 / np.sqrt(30))
-    assert found["outdoor_scale"] == pytest.approx(3.0, rel=4 / np.sqrt(60))
-    assert found["outdoor_lengthscale"] == pytest.approx(10.0, rel=0.3)
+    assert result["outdoor_mean"] == pytest.approx(6.0, abs=4 * 3.0 / np.sqrt(30))
+    assert result["outdoor_scale"] == pytest.approx(3.0, rel=4 / np.sqrt(60))
+    assert result["outdoor_lengthscale"] == pytest.approx(10.0, rel=0.3)
 
 
 @pytest.mark.slow

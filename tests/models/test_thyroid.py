@@ -88,8 +88,8 @@ def test_full_information_against_ipopt():
     model = own.build(level, scale, lengthscale, variation)
     names = (*model.state_names, "TRH")
     bounds = dict.fromkeys(names, 0.0) | {"TRH": 7.5}
-    found = lfm.full_information(model, times, y, lower=bounds, grid=times, steps=32, tolerance=1e-10)
-    assert found.converged
+    result = lfm.full_information(model, times, y, lower=bounds, grid=times, steps=32, tolerance=1e-10)
+    assert result.converged
 
     def drift(x, u):
         trh = (u + level) * 1e-9
@@ -114,9 +114,9 @@ def test_full_information_against_ipopt():
     # From the steady state and the prior mean of TRH, and not from our own solution.
     guess = np.tile([1.0, 1.0, 1.0, 1.0, 0.0, 0.0], (len(times), 1))
     nodes, objective = reference.solve(times, np.asarray(y), guess, rounds=8)
-    assert float(found.objective) == pytest.approx(objective, abs=1e-4)
-    np.testing.assert_allclose(np.asarray(found.force("TRH")) - level, nodes[:, 4], atol=1e-3)
+    assert float(result.objective) == pytest.approx(objective, abs=1e-4)
+    np.testing.assert_allclose(np.asarray(result.force("TRH")) - level, nodes[:, 4], atol=1e-3)
     # Its bounds are met to 1e-8; TRH moves by nmol/l between rows.
     at_bound = nodes[:, :5] - [0.0, 0.0, 0.0, 0.0, 7.5 - level] < 1e-5
-    np.testing.assert_array_equal(np.asarray(found.active), at_bound)
+    np.testing.assert_array_equal(np.asarray(result.active), at_bound)
     assert at_bound[:, 4].any() and not at_bound.all(axis=0).any() and not at_bound[:, :4].any()

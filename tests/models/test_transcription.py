@@ -169,13 +169,13 @@ def test_p53_posterior_is_that_of_the_force_on_a_grid(file):
     anchors, keywords, hours = file.anchors(data), file.keywords(data, {}), np.unique(data.times)
 
     def columns(posterior, forces):
-        found = {f"u({hour:g})": forces[..., index] for index, hour in enumerate(hours)}
+        result = {f"u({hour:g})": forces[..., index] for index, hour in enumerate(hours)}
         for name in file.parameters:
             value = np.log(np.asarray(posterior[name]))
             labels = [name] if value.ndim == 2 else [f"{name}[{gene}]" for gene in data.outputs]
             parts = np.moveaxis(value.reshape(*value.shape[:2], -1), -1, 0)
-            found |= {label: part for label, part in zip(labels, parts, strict=True) if label not in anchors}
-        return diagnostics.summary(found)
+            result |= {label: part for label, part in zip(labels, parts, strict=True) if label not in anchors}
+        return diagnostics.summary(result)
 
     latent = fix(lfm.on_latent_grid(file.model, points=61), anchors, data.outputs)
     mcmc = MCMC(NUTS(latent, dense_mass=True, init_strategy=init_to_median), num_warmup=600, num_samples=800,
@@ -186,13 +186,15 @@ def test_p53_posterior_is_that_of_the_force_on_a_grid(file):
     result = lfm.fit(file.model, data.times, data.y, model_kwargs=keywords, fixed=anchors, at=hours, warmup=600,
                      samples=600, trajectory_draws=2400, progress=False)
     forces = group(result, "trajectories")["forces"].isel(force=0).transpose("chain", "draw", "at")
-    found = columns(group(result, "posterior"), forces.values)
-    assert set(found) == set(exact) and len(found) == 20 + len(hours)
+    computed = columns(group(result, "posterior"), forces.values)
+    assert set(computed) == set(exact) and len(computed) == 20 + len(hours)
     for label, one in exact.items():
-        error = np.hypot(1 / np.sqrt(one["n_eff"]), found[label]["std"] / one["std"] / np.sqrt(found[label]["n_eff"]))
-        shift = (found[label]["mean"] - one["mean"]) / one["std"]
+        error = np.hypot(
+            1 / np.sqrt(one["n_eff"]), computed[label]["std"] / one["std"] / np.sqrt(computed[label]["n_eff"])
+        )
+        shift = (computed[label]["mean"] - one["mean"]) / one["std"]
         print(f"{label:24s} {shift:+.3f} sd, Monte Carlo error {error:.3f}")
-        assert max(one["r_hat"], found[label]["r_hat"]) < 1.01 and error < 0.05
+        assert max(one["r_hat"], computed[label]["r_hat"]) < 1.01 and error < 0.05
         assert abs(shift) < 0.1 + 4 * error, label
 
 
@@ -276,9 +278,9 @@ def test_log_evidence_is_that_of_importance_sampling(file, activity, link):
         exact, error, effective = log_evidence(parameters, np.asarray(data.times), np.asarray(data.y),
                                                lambda u: activity(u, link, 0.5))
         assert error < 0.005 and effective > 10_000
-        found = {n: trace(condition(approximate(file.model, iterations=n), parameters)).get_trace(
+        result = {n: trace(condition(approximate(file.model, iterations=n), parameters)).get_trace(
             data.times, data.y, **keywords)["y"] for n in (0, 3)}
-        single, iterated = (float(site["fn"].log_prob(site["value"])) - exact for site in found.values())
+        single, iterated = (float(site["fn"].log_prob(site["value"])) - exact for site in result.values())
         errors.append(iterated)
         of_single_pass.append(single)
     print(link, "three iterations", np.round(errors, 3), "single pass", np.round(of_single_pass, 2))

@@ -43,11 +43,11 @@ def potential(r, degree):
 @pytest.mark.parametrize("degree", [0, 2, 8])
 @pytest.mark.parametrize("r", PLACES)
 def test_gravity_is_the_gradient_of_the_potential(r, degree):
-    found = np.asarray(jax.jit(geopotential.acceleration, static_argnums=1)(r, degree))
+    result = np.asarray(jax.jit(geopotential.acceleration, static_argnums=1)(r, degree))
     whole = gradient(lambda p: potential(p, degree), r)
-    assert np.abs(found - whole).max() < 1e-8 * np.linalg.norm(whole)
+    assert np.abs(result - whole).max() < 1e-8 * np.linalg.norm(whole)
     if degree == 0:
-        np.testing.assert_allclose(found, -geopotential.GM * r / np.linalg.norm(r) ** 3, rtol=1e-14)
+        np.testing.assert_allclose(result, -geopotential.GM * r / np.linalg.norm(r) ** 3, rtol=1e-14)
 
 
 def test_gravity_has_a_gradient_at_the_pole():
@@ -63,8 +63,8 @@ def test_a_body_pulls_the_satellite_more_than_the_earth(r, body):
     wide = [np.array(a, np.longdouble) for a in (r, body)]
     away = wide[1] - wide[0]
     expected = away / np.sqrt((away**2).sum()) ** 3 - wide[1] / np.sqrt((wide[1] ** 2).sum()) ** 3
-    found = np.asarray(bodies.attraction(jnp.asarray(r), jnp.asarray(body), 1.0))
-    np.testing.assert_allclose(found, expected.astype(float), rtol=1e-11, atol=1e-14 * np.abs(expected).max())
+    result = np.asarray(bodies.attraction(jnp.asarray(r), jnp.asarray(body), 1.0))
+    np.testing.assert_allclose(result, expected.astype(float), rtol=1e-11, atol=1e-14 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("r", PLACES)
@@ -77,8 +77,8 @@ def test_the_tide_is_the_gradient_of_its_potential(r):
         return (bodies.LOVE_NUMBER * bodies.GM_MOON * geopotential.RADIUS**5 / distance**3
                 / np.linalg.norm(p) ** 3 * (1.5 * cosine**2 - 0.5))
 
-    found = bodies.solid_tide(jnp.asarray(r), jnp.asarray(MOON), bodies.GM_MOON)
-    np.testing.assert_allclose(found, gradient(raised, r), rtol=1e-6, atol=1e-8 * np.abs(found).max())
+    result = bodies.solid_tide(jnp.asarray(r), jnp.asarray(MOON), bodies.GM_MOON)
+    np.testing.assert_allclose(result, gradient(raised, r), rtol=1e-6, atol=1e-8 * np.abs(result).max())
 
 
 def test_sunlight_is_the_visible_part_of_the_disc():
@@ -88,17 +88,17 @@ def test_sunlight_is_the_visible_part_of_the_disc():
     sun = np.array([1.496e8, 0.0, 0.0])
     # Behind the Earth, on a circle of 26,560 km, through the whole penumbra.
     angles = np.linspace(0.2355, 0.2495, 57)
-    found, expected = [], []
+    result, expected = [], []
     for angle in angles:
         r = 26_560.0 * np.array([-np.cos(angle), np.sin(angle), 0.0])
-        found.append(float(bodies.sunlight(jnp.asarray(r), jnp.asarray(sun))))
+        result.append(float(bodies.sunlight(jnp.asarray(r), jnp.asarray(sun))))
         to_sun, to_earth = sun - r, -r
         between = np.arccos(to_sun @ to_earth / np.linalg.norm(to_sun) / np.linalg.norm(to_earth))
         a, b = np.arcsin(bodies.SUN_RADIUS / np.linalg.norm(to_sun)), np.arcsin(geopotential.RADIUS / 26_560.0)
         seen = np.hypot(between + a * u, a * v) > b
         expected.append((disc & seen).sum() / disc.sum())
-    assert found[0] == 0.0 and found[-1] == 1.0 and np.all(np.diff(found) >= 0)
-    assert np.abs(np.array(found) - expected).max() < 0.01
+    assert result[0] == 0.0 and result[-1] == 1.0 and np.all(np.diff(result) >= 0)
+    assert np.abs(np.array(result) - expected).max() < 0.01
     assert float(bodies.sunlight(jnp.array([26_560.0, 0.0, 0.0]), jnp.asarray(sun))) == 1.0
     slopes = jax.vmap(jax.grad(lambda a: bodies.sunlight(26_560.0 * jnp.array([-jnp.cos(a), jnp.sin(a), 0.0]), sun)))
     assert np.isfinite(slopes(jnp.asarray(angles))).all()
@@ -130,11 +130,11 @@ def test_earth_rotation_equals_pyerfa():
 
 def test_earth_orientation_is_that_of_the_iers():
     """Bulletin values of 7 April 2019, 0 h UTC, which is 18 s of GPS time later."""
-    found = earth.orientation(np.array([EPOCH + 18.0]))
-    assert found.ut1_minus_utc[0] == pytest.approx(-0.1263186, abs=1e-6)
+    result = earth.orientation(np.array([EPOCH + 18.0]))
+    assert result.ut1_minus_utc[0] == pytest.approx(-0.1263186, abs=1e-6)
     arcsecond = np.pi / 180 / 3600
-    assert found.x[0] / arcsecond == pytest.approx(0.051831, abs=1e-5)
-    assert found.y[0] / arcsecond == pytest.approx(0.391315, abs=1e-5)
+    assert result.x[0] / arcsecond == pytest.approx(0.051831, abs=1e-5)
+    assert result.y[0] / arcsecond == pytest.approx(0.391315, abs=1e-5)
     with pytest.raises(ValueError, match="Earth orientation is known from MJD"), pytest.warns(Warning, match="dubious"):
         earth.orientation(np.array([orbits.gps_seconds(2150, 1, 1)]))
 
@@ -142,11 +142,11 @@ def test_earth_orientation_is_that_of_the_iers():
 def test_utc_jumps_and_ut1_does_not():
     """Through the leap second at the end of 2016, UT1 goes on smoothly in GPS time."""
     seconds = orbits.gps_seconds(2017, 1, 1) + np.array([-7200.0, 0.0, 17.0, 18.0, 7200.0])
-    found = earth.orientation(seconds)
+    result = earth.orientation(seconds)
     first, second = times.utc(seconds)
-    ut1 = sum(erfa.utcut1(first, second, found.ut1_minus_utc)) - times.GPS_START - 13_510.0
+    ut1 = sum(erfa.utcut1(first, second, result.ut1_minus_utc)) - times.GPS_START - 13_510.0
     ahead = (ut1 - (seconds - orbits.gps_seconds(2017, 1, 1)) / 86_400.0) * 86_400.0
-    assert np.ptp(ahead) < 1e-3 and found.ut1_minus_utc[-1] - found.ut1_minus_utc[0] == pytest.approx(1.0, abs=1e-3)
+    assert np.ptp(ahead) < 1e-3 and result.ut1_minus_utc[-1] - result.ut1_minus_utc[0] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_gps_time_is_not_utc():

@@ -107,11 +107,11 @@ def test_departures_are_predicted_as_the_satellite_itself(satellite):
     near = prediction.surroundings(one, orbit, axes)
     vector = magnitudes.wide(axes).mean
     mean, covariance = prediction.filter_positions(one, orbit, vector, axes, one.learnt())
-    found = prediction.predict(one, near, vector[None])
+    result = prediction.predict(one, near, vector[None])
     after = slice(one.train, None)
     sd = np.sqrt(np.diagonal(covariance[after], axis1=1, axis2=2))
-    assert np.abs(found.state[after, :3] - mean[after]).max() < 2e-2 * sd.min()
-    assert np.abs(found.covariance[after] / covariance[after] - 1)[:, [0, 1, 2], [0, 1, 2]].max() < 1e-2
+    assert np.abs(result.state[after, :3] - mean[after]).max() < 2e-2 * sd.min()
+    assert np.abs(result.covariance[after] / covariance[after] - 1)[:, [0, 1, 2], [0, 1, 2]].max() < 1e-2
 
 
 BEGIN, COUNT, GROWTH = 10.25, 11, 0.1
@@ -200,18 +200,18 @@ def test_densities_of_positions_are_those_of_a_gaussian(freely):
 @pytest.mark.parametrize("logarithm", [400.0, np.inf, np.nan])
 def test_magnitudes_beyond_numbers_have_minus_infinity_and_zero_slopes(freely, slope, logarithm):
     data, vector, _, _ = freely
-    value, found = slope(np.full_like(vector, logarithm), data.regression, data.axes)
-    assert value == -np.inf and (np.asarray(found) == 0.0).all()
-    value, found = slope(np.full_like(vector, -400.0), data.regression, data.axes)
-    assert np.isfinite(value) and np.isfinite(found).all()
+    value, result = slope(np.full_like(vector, logarithm), data.regression, data.axes)
+    assert value == -np.inf and (np.asarray(result) == 0.0).all()
+    value, result = slope(np.full_like(vector, -400.0), data.regression, data.axes)
+    assert np.isfinite(value) and np.isfinite(result).all()
 
 
 def test_a_matrix_without_a_root_has_no_density_and_zero_slopes(freely):
     data, vector, _, _ = freely
     wrong = data.regression._replace(noise=-data.noise)
     for slope in (training.slope_of_held_out, training.slope_of_log_likelihood):
-        value, found = slope(vector, wrong, data.axes)
-        assert value == -np.inf and (np.asarray(found) == 0.0).all()
+        value, result = slope(vector, wrong, data.axes)
+        assert value == -np.inf and (np.asarray(result) == 0.0).all()
 
 
 @pytest.fixture(scope="module", params=["DYB", "RTN"])
@@ -231,9 +231,9 @@ def test_the_regression_has_the_densities_of_the_filter(learning_from):
     assert np.isnan(data.y).any() and len(data.times) == 36
     settings = {"rule": lfm.Taylor(), "steps": training.steps_of(data.times)}
     system = training.departing(vector, data.neighbourhood, data.axes)
-    found = lfm.filter(system, data.times, data.y, **settings)
+    result = lfm.filter(system, data.times, data.y, **settings)
     assert float(training.log_likelihood(vector, data.regression, data.axes)) == pytest.approx(
-        float(found.log_likelihood.sum()), rel=1e-8)
+        float(result.log_likelihood.sum()), rel=1e-8)
     total = 0.0
     for seen in (12, 24):
         passed = lfm.filter(system, data.times, np.where(np.arange(36)[:, None] < seen, data.y, np.nan), **settings)

@@ -88,9 +88,9 @@ def test_an_orbit_is_found_again(around):
     truth = orbits.propagate(around, orbit, TIMES)
     y = truth[:, :3] + 1e-5 * np.random.default_rng(0).normal(size=(97, 3))
     y[[12, 40, 41]] = np.nan
-    found = orbits.fit_orbit(around, TIMES, y)
-    assert abs(found.solar - 93.0) < 0.2 and np.abs(found.state - START)[:3].max() < 3e-5
-    assert found.residual == pytest.approx(1e-5 * np.sqrt(3), rel=0.2)
+    result = orbits.fit_orbit(around, TIMES, y)
+    assert abs(result.solar - 93.0) < 0.2 and np.abs(result.state - START)[:3].max() < 3e-5
+    assert result.residual == pytest.approx(1e-5 * np.sqrt(3), rel=0.2)
     for bad, message in ((TIMES**2, "equally spaced"), (TIMES[:1], "equally spaced")):
         with pytest.raises(ValueError, match=message):
             orbits.fit_orbit(around, bad, y[:len(bad)])
@@ -150,8 +150,8 @@ def test_small_forces_and_satellite_say_what_is_wrong(around):
 
 def test_start_of_an_orbit_from_positions(around):
     truth = orbits.propagate(around, orbits.Orbit(0.0, START, 100.0, 0.0), TIMES)
-    found = orbits.start_near(TIMES, truth[:, :3])
-    assert np.abs(found.mean - START)[:3].max() < 1e-9 and np.abs(found.mean - START)[3:].max() < 1e-3
+    result = orbits.start_near(TIMES, truth[:, :3])
+    assert np.abs(result.mean - START)[:3].max() < 1e-9 and np.abs(result.mean - START)[3:].max() < 1e-3
     holes = truth[:, :3].copy()
     holes[[2, 5]] = np.nan
     near = np.abs(orbits.start_near(TIMES, holes).mean - START)
@@ -174,9 +174,9 @@ def test_departures_follow_two_orbits_that_differ_a_little(around):
     nothing = np.full((len(TIMES), 3), np.nan)
     nothing[0] = change[:3]
     for steps, error in ((2, 1e-3), (4, 1e-4)):
-        found = lfm.filter(model, TIMES, nothing, rule=lfm.Taylor(), steps=steps).filtered_mean[:, :6]
+        result = lfm.filter(model, TIMES, nothing, rule=lfm.Taylor(), steps=steps).filtered_mean[:, :6]
         apart = other - np.asarray(near.path)
-        assert np.abs(found - apart).max() < error * np.abs(apart).max()
+        assert np.abs(result - apart).max() < error * np.abs(apart).max()
 
 
 def test_the_table_of_a_neighbourhood_holds_means():

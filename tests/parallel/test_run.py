@@ -65,9 +65,9 @@ def test_a_killed_run_ends_with_the_same_numbers(tmp_path):
         run_tasks(tasks(), killed, tmp_path / "half")
     assert sorted(path.name for path in (tmp_path / "half").glob("[!.]*")) == ["noise-00.npz", "noise-01.npz"]
     resumed = []
-    found = run_tasks(tasks(), lambda task: resumed.append(task.name) or noise(task), tmp_path / "half")
+    result = run_tasks(tasks(), lambda task: resumed.append(task.name) or noise(task), tmp_path / "half")
     assert resumed == ["noise/02", "noise/03"]
-    same(whole, found)
+    same(whole, result)
 
 
 def broken(task):
@@ -108,11 +108,11 @@ def process(task):
 
 
 def test_workers_have_one_thread_and_share_compiled_programs(workers):
-    found = run_tasks(tasks(8), process, None, workers=workers)
-    assert len({one["process"] for one in found.values()} - {os.getpid()}) == 2
-    assert {one["variables"] for one in found.values()} == {
+    result = run_tasks(tasks(8), process, None, workers=workers)
+    assert len({one["process"] for one in result.values()} - {os.getpid()}) == 2
+    assert {one["variables"] for one in result.values()} == {
         "PJRT_NPROC=1 OMP_NUM_THREADS=1 XLA_PYTHON_CLIENT_PREALLOCATE=false"}
-    assert {one["cache"] for one in found.values()} == {jax.config.jax_compilation_cache_dir}
+    assert {one["cache"] for one in result.values()} == {jax.config.jax_compilation_cache_dir}
 
 
 def timed(task):
@@ -169,8 +169,8 @@ def mortal(folder, *deaths):
 
 
 def test_a_task_whose_worker_died_is_computed_again(tmp_path, workers):
-    found = run_tasks(mortal(tmp_path, 0, 1, 0), dies, tmp_path / "out", workers=workers)
-    same(found, run_tasks(tasks(3), noise, None))
+    result = run_tasks(mortal(tmp_path, 0, 1, 0), dies, tmp_path / "out", workers=workers)
+    same(result, run_tasks(tasks(3), noise, None))
     assert (tmp_path / "noise-01-0").exists()
 
 
@@ -363,8 +363,8 @@ from lfm_ppl.parallel.task import Task
 print(run_tasks([Task("a", 0)], lambda task: {{"x": 1.0}}, {str(tmp_path)!r}),
       [name for name in sys.modules if name.split(".")[0] in ("dask", "distributed")])
 """
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=120)
-    assert found.stdout.strip() == "{'a': {'x': 1.0}} []", found.stderr
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=120)
+    assert result.stdout.strip() == "{'a': {'x': 1.0}} []", result.stderr
 
 
 def nothing(task):
@@ -408,8 +408,8 @@ def test_other_settings_are_refused_and_replaced_on_request(tmp_path):
     run_tasks(tasks(2), noise, tmp_path)
     with pytest.raises(ValueError, match=r"other settings: size is 3 there and 5 now.*--overwrite"):
         run_tasks(tasks(2, size=5), noise, tmp_path)
-    found = run_tasks(tasks(2, size=5), noise, tmp_path, overwrite=True)
-    assert found["noise/00"]["draws"].shape == (5,)
+    result = run_tasks(tasks(2, size=5), noise, tmp_path, overwrite=True)
+    assert result["noise/00"]["draws"].shape == (5,)
 
 
 def test_another_seed_is_refused(tmp_path):
@@ -429,17 +429,17 @@ def test_a_damaged_file_is_computed_again_with_a_warning(tmp_path, damage):
     else:
         path.write_bytes(damage)
     with pytest.warns(UserWarning, match="noise-01.npz cannot be read"):
-        found = run_tasks(tasks(2), noise, tmp_path)
-    same(whole, found)
+        result = run_tasks(tasks(2), noise, tmp_path)
+    same(whole, result)
 
 
 def test_values_come_back_as_they_were(tmp_path):
     task = Task("a", 0)
     values = {"number": 0.1, "whole": 3, "flag": True, "text": "ok", "array": np.arange(3.0)}
     write_result(task, values, RunStore(tmp_path))
-    found = read_result(task, RunStore(tmp_path))
-    assert (found["number"], found["whole"], found["flag"], found["text"]) == (0.1, 3, True, "ok")
-    np.testing.assert_array_equal(found["array"], np.arange(3.0))
+    result = read_result(task, RunStore(tmp_path))
+    assert (result["number"], result["whole"], result["flag"], result["text"]) == (0.1, 3, True, "ok")
+    np.testing.assert_array_equal(result["array"], np.arange(3.0))
 
 
 def test_what_cannot_be_stored_is_refused(tmp_path):

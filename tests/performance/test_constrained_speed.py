@@ -61,9 +61,9 @@ def problem(times, y):
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_1501_rows_in_25_passes(shape):
-    found = lfm.full_information(MODEL, *data(1501, SHAPES[shape]), lower={"factor": 0.0})
-    assert found.converged and found.gap <= 1e-10 and found.passes <= 25
-    assert found.force_mean.min() >= 0.0
+    result = lfm.full_information(MODEL, *data(1501, SHAPES[shape]), lower={"factor": 0.0})
+    assert result.converged and result.gap <= 1e-10 and result.passes <= 25
+    assert result.force_mean.min() >= 0.0
 
 
 def seconds(run, *arguments):
@@ -105,5 +105,5 @@ def test_linear_in_time():
 
 
 def test_100_000_rows():
-    found = lfm.full_information(MODEL, *data(100_000, SHAPES["sine"]), lower={"factor": 0.0})
-    assert found.converged and found.passes <= 40
+    result = lfm.full_information(MODEL, *data(100_000, SHAPES["sine"]), lower={"factor": 0.0})
+    assert result.converged and result.passes <= 40

@@ -30,8 +30,8 @@ def test_ten_days_of_33_states(benchmark, rule):
     def likelihood(logarithms, y):
         forces, white = magnitudes.forces(logarithms, "DYB", orbits.GPS_PERIOD)
         system = orbits.satellite(environment, start, forces, white=white)
-        found = lfm.filter(system, times, y, rule=rule, steps=30)
-        return found.log_likelihood.sum(), found.filtered_mean
+        result = lfm.filter(system, times, y, rule=rule, steps=30)
+        return result.log_likelihood.sum(), result.filtered_mean
 
     logarithms = jnp.asarray(magnitudes.wide("DYB").mean)
     value, mean = jax.block_until_ready(likelihood(logarithms, y))

@@ -20,7 +20,7 @@ def test_a_day_ahead_with_a_thousand_particles(benchmark):
     def predict():
         return jax.block_until_ready(prediction.predict_under_thermostat(model, window, z, 1000, jax.random.key(0))[1])
 
-    found = predict()
-    assert np.isfinite(found.mean).all() and found.inputs.shape == (149, 1000)
+    result = predict()
+    assert np.isfinite(result.mean).all() and result.inputs.shape == (149, 1000)
     benchmark.pedantic(predict, rounds=3)
     assert benchmark.stats.stats.median < 2.0

@@ -41,10 +41,10 @@ def test_average_is_the_log_of_the_mean_with_the_variance_of_the_jackknife():
     sd, replicates = 0.4, 4
     generator = np.random.default_rng(0)
     noise = generator.normal(-0.5 * sd**2, sd, (20_000, replicates))  # mean one on the scale of the likelihood
-    found = importance.average(3.0 + noise)
-    assert abs(np.exp(found.log_mean - 3.0).mean() - 1.0) < 4 * np.sqrt(np.expm1(sd**2) / noise.size)
+    result = importance.average(3.0 + noise)
+    assert abs(np.exp(result.log_mean - 3.0).mean() - 1.0) < 4 * np.sqrt(np.expm1(sd**2) / noise.size)
     # The spread over 20,000 draws is known to 0.5%; the jackknife's bias is of second order in the variance, 0.16 / 4.
-    np.testing.assert_allclose(np.sqrt(found.variance.mean()), found.log_mean.std(), rtol=0.04)
+    np.testing.assert_allclose(np.sqrt(result.variance.mean()), result.log_mean.std(), rtol=0.04)
     np.testing.assert_allclose(importance.average(np.array([[1.0, 1.0]])).log_mean, [1.0])
     assert importance.average(np.full((1, 3), -np.inf)).log_mean[0] == -np.inf
     assert np.isnan(importance.average(np.zeros((2, 1))).variance).all()
@@ -87,9 +87,9 @@ def test_k_tells_heavy_tails():
     """Ratios that are Pareto variables of shape k have tails of shape k."""
     uniform = np.random.default_rng(3).uniform(size=(1, 4000))
     for k in (0.2, 0.5, 0.9):
-        found = importance.smooth(-k * np.log(uniform))
-        assert abs(found.k - k) < 0.2  # 190 tail draws: sd (1 + k) / sqrt(190), at most 0.14
-        assert found.reliable == (found.k < 0.7)
+        result = importance.smooth(-k * np.log(uniform))
+        assert abs(result.k - k) < 0.2  # 190 tail draws: sd (1 + k) / sqrt(190), at most 0.14
+        assert result.reliable == (result.k < 0.7)
     assert importance.smooth(np.arange(4.0)[None]).k == np.inf  # too few draws
     with pytest.raises(ValueError, match="likelihood of zero"):
         importance.smooth(np.full((2, 10), -np.inf))
@@ -361,9 +361,9 @@ def test_enough_particles_are_found(bent):
     problem = rebuilding.problem(bent, well).select(np.arange(0, 400, 25))
     settings = likelihoods.ReferenceSettings("particles", None, 2)
     noise = lambda e: accuracy.noise(importance.average(e))  # noqa: E731
-    found = likelihoods.by_particles(problem, settings, noise, 0.02, 1e12)
-    assert found.particles > 1000 and not found.limited
-    assert noise(found.estimates) < 0.03
+    result = likelihoods.by_particles(problem, settings, noise, 0.02, 1e12)
+    assert result.particles > 1000 and not result.limited
+    assert noise(result.estimates) < 0.03
     limited = likelihoods.by_particles(problem, settings, noise, 0.001, 1e6)
     assert limited.particles == 1000 and limited.limited
 

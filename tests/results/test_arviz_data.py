@@ -136,9 +136,9 @@ def test_round_trip_of_awkward_attributes(tmp_path):
     )
     built = arviz_data.build({"posterior": dataset}, attrs)
     loaded = arviz_data.load(arviz_data.save(built, tmp_path / "a.nc"))
-    found = arviz_data.attributes(loaded)
-    assert {key: found[key] for key in attrs} == attrs
-    assert all(type(found[key]) is type(value) for key, value in attrs.items())
+    result = arviz_data.attributes(loaded)
+    assert {key: result[key] for key in attrs} == attrs
+    assert all(type(result[key]) is type(value) for key, value in attrs.items())
     xr.testing.assert_identical(arviz_data.group(loaded, "posterior"), dataset)
 
 
@@ -147,11 +147,11 @@ def test_arrays_in_attributes_come_back_as_lists(tmp_path):
         {"posterior": xr.Dataset({"x": ("draw", [1.0])})},
         {"array": np.arange(3), "scalar": np.float32(0.5), "whole": np.int64(4), "set": {"b", "a"}},
     )
-    found = arviz_data.attributes(arviz_data.load(arviz_data.save(built, tmp_path / "a.nc")))
-    assert found["array"] == [0, 1, 2]
-    assert found["scalar"] == 0.5
-    assert found["whole"] == 4
-    assert found["set"] == ["a", "b"]
+    result = arviz_data.attributes(arviz_data.load(arviz_data.save(built, tmp_path / "a.nc")))
+    assert result["array"] == [0, 1, 2]
+    assert result["scalar"] == 0.5
+    assert result["whole"] == 4
+    assert result["set"] == ["a", "b"]
 
 
 @pytest.mark.parametrize("dtype", ["float32", "int16", "bool", "<U3"])
@@ -302,18 +302,18 @@ def test_convergence_warnings_name_parameter_value_and_remedy(datasets):
     apart = rng.normal(size=(4, 100)) + np.arange(4)[:, None]
     datasets["posterior"]["stuck"] = (("chain", "draw"), apart)
     broken = arviz_data.build(datasets, {"sampler": "nuts"})
-    found = arviz_data.convergence_warnings(broken)
+    result = arviz_data.convergence_warnings(broken)
     row = arviz_data.summary(broken).loc["stuck"]
-    r_hat = next(text for text in found if text.startswith("R-hat is above 1.01"))
+    r_hat = next(text for text in result if text.startswith("R-hat is above 1.01"))
     assert f"stuck ({row['r_hat']:.3f})" in r_hat and "Run longer" in r_hat
     assert "decay" not in r_hat or ", decay" in r_hat  # the worst comes first
-    bulk = next(text for text in found if text.startswith("bulk effective sample size"))
+    bulk = next(text for text in result if text.startswith("bulk effective sample size"))
     assert f"below 400 (100 per chain) for stuck ({row['ess_bulk']:.0f})" in bulk
     assert f"about {int(np.ceil(400 / row['ess_bulk']))}-fold" in bulk
-    diverged = next(text for text in found if "diverged" in text)
+    diverged = next(text for text in result if "diverged" in text)
     assert diverged.startswith("3 of 400 transitions diverged (0.75%)")
     assert "target_accept_prob" in diverged
-    assert not any("anchor" in text for text in found)
+    assert not any("anchor" in text for text in result)
 
 
 def test_warnings_for_one_chain_bad_draws_and_many_parameters():
@@ -327,8 +327,8 @@ def test_warnings_for_one_chain_bad_draws_and_many_parameters():
     few = arviz_data.convergence_warnings(draws_only(rng.normal(size=(4, 3))))
     assert few == ["3 draws per chain are too few for R-hat and ESS. Raise samples."]
     many = xr.Dataset({"x": (("chain", "draw", "k"), rng.normal(size=(4, 20, 9)))})
-    found = arviz_data.convergence_warnings(arviz_data.build({"posterior": many}))
-    assert any("and 4 more" in text for text in found)
+    result = arviz_data.convergence_warnings(arviz_data.build({"posterior": many}))
+    assert any("and 4 more" in text for text in result)
 
 
 def test_laplace_draws_are_independent():

@@ -29,11 +29,11 @@ def test_the_statistics_accept_uniform_ranks():
 def test_p_values_are_those_of_pearson_and_kolmogorov():
     """Many data sets and possible ranks: the simulated distributions approach the known ones."""
     rank = np.random.default_rng(4).integers(0, 1024, 2000)
-    found = calibration.p_values(rank, 1023, 16)
+    result = calibration.p_values(rank, 1023, 16)
     counts = np.bincount(rank // 64, minlength=16)
     # 20,000 simulations: a standard error of at most 0.0035
-    assert abs(found["chi-square"] - stats.chisquare(counts).pvalue) < 0.02
-    assert abs(found["ecdf"] - stats.kstest((rank + 0.5) / 1024, "uniform").pvalue) < 0.05
+    assert abs(result["chi-square"] - stats.chisquare(counts).pvalue) < 0.02
+    assert abs(result["ecdf"] - stats.kstest((rank + 0.5) / 1024, "uniform").pvalue) < 0.05
 
 
 def level(times, y=None, noise=1.0):
@@ -98,18 +98,18 @@ def test_exact_draws_are_calibrated_and_wide_ones_are_not(conjugate):
 
 
 def test_one_by_one_finds_the_same_ranks(conjugate):
-    found = run(1.0, method="sequential")
+    result = run(1.0, method="sequential")
     for name, rank in conjugate[0].ranks.items():
-        np.testing.assert_array_equal(found.ranks[name], rank)
+        np.testing.assert_array_equal(result.ranks[name], rank)
 
 
 @pytest.mark.slow
 def test_tasks_in_a_folder_find_the_same_ranks_and_go_on(conjugate, tmp_path):
     lines = []
     for count in (2, 1, 0):
-        found = run(1.0, batch=200, folder=tmp_path, report=lines.append)
+        result = run(1.0, batch=200, folder=tmp_path, report=lines.append)
         for name, rank in conjugate[0].ranks.items():
-            np.testing.assert_array_equal(found.ranks[name], rank)
+            np.testing.assert_array_equal(result.ranks[name], rank)
         assert sum("data-sets/" in line for line in lines) == count
         lines.clear()
         if count == 2:
@@ -122,10 +122,10 @@ def test_tasks_in_a_folder_find_the_same_ranks_and_go_on(conjugate, tmp_path):
 def test_ranks_survive_a_file_and_are_not_overwritten(tmp_path):
     made = calibration.Calibration({"decay[0]": np.array([0, 7, 3]), "log likelihood": np.array([1, 2, 3])}, 7)
     path = calibration.save(made, tmp_path / "deep" / "ranks.npz")
-    found = calibration.load(path)
-    assert found.draws == 7 and set(found.ranks) == set(made.ranks)
+    result = calibration.load(path)
+    assert result.draws == 7 and set(result.ranks) == set(made.ranks)
     for name in made.ranks:
-        np.testing.assert_array_equal(found.ranks[name], made.ranks[name])
+        np.testing.assert_array_equal(result.ranks[name], made.ranks[name])
     with pytest.raises(FileExistsError, match="already exists"):
         calibration.save(made, path)
     assert calibration.save(made, path, overwrite=True) == path

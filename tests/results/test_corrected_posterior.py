@@ -44,13 +44,13 @@ def exact(wells):
         ssm = state_space(site.distribution.model)
         return log_likelihood(ssm, build_time_grid(ssm, times, 1), y, Grid(-9.0, 9.0, 220))
 
-    found = np.asarray(jax.jit(lambda n: jax.lax.map(one, n))(jnp.asarray(nodes)))
+    result = np.asarray(jax.jit(lambda n: jax.lax.map(one, n))(jnp.asarray(nodes)))
     # The model's priors, in the coordinates of the nodes: normal for all three.
     prior = -0.5 * (((nodes - [0.5, 0.0, -3.0]) / [0.5, 0.5, 1.0]) ** 2).sum(axis=1)
     values = {"sigma": np.exp(nodes[:, 0]), "linear": nodes[:, 1], "cubic": np.exp(nodes[:, 2])}
     moments = {}
     for index, seed in enumerate(data):
-        log_weight = found[:, index] + prior
+        log_weight = result[:, index] + prior
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()
         cube = weight.reshape(22, 22, 26)
@@ -99,12 +99,12 @@ def test_particle_marginal_chains_find_it(wells, exact, samples, options):
     needs more draws.
     """
     model, data = wells
-    found = lfm.fit(model, data[ELSEWHERE].times, data[ELSEWHERE].y, sampler="pmmh", chains=4, warmup=500,
+    result = lfm.fit(model, data[ELSEWHERE].times, data[ELSEWHERE].y, sampler="pmmh", chains=4, warmup=500,
                     samples=samples, thin=5, trajectory_draws=0, progress=False,
                     sampler_options={"particle_steps": 20, **options})
-    table = summary(found)
+    table = summary(result)
     assert table.loc[list(NAMES), "ess_bulk"].min() > 100
-    draws = group(found, "posterior")
+    draws = group(result, "posterior")
     for name, (mean, sd) in exact[ELSEWHERE].items():
         row = table.loc[name]
         assert abs(row["mean"] - mean) < 4.0 * row["mcse_mean"], name

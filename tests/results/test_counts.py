@@ -82,12 +82,12 @@ def test_log_score_is_that_of_the_family_along_the_paths(ahead):
     level = posterior["level"].values[:, predicted["draw"].values]
     rate = 1.5 * np.exp(level[..., None] + predicted["forces"].values[..., 0]).reshape(-1, 2)
     log_p = special.logsumexp(stats.poisson.logpmf(HELD_OUT[:, 0], rate), axis=0) - np.log(len(rate))
-    found = lfm.score(ahead, HELD_OUT, numpyro_model=counts).loc["events"]
-    assert found["log_score"] == pytest.approx(log_p.mean(), abs=1e-12)
+    result = lfm.score(ahead, HELD_OUT, numpyro_model=counts).loc["events"]
+    assert result["log_score"] == pytest.approx(log_p.mean(), abs=1e-12)
     drawn = predicted["y"].values.reshape(len(rate), 2)
     far = np.abs(drawn - HELD_OUT[:, 0]).mean(0) - 0.5 * np.abs(drawn[:, None] - drawn).sum((0, 1)) / (
         len(rate) * (len(rate) - 1))
-    assert found["crps"] == pytest.approx(far.mean(), rel=1e-12)
+    assert result["crps"] == pytest.approx(far.mean(), rel=1e-12)
     assert np.isnan(lfm.score(ahead, HELD_OUT).loc["events", "log_score"])
     with pytest.raises(ValueError, match="pass what lfm.forecast returned"):
         lfm.score(arviz_data.group(ahead, "predictions"), HELD_OUT, numpyro_model=counts)
@@ -108,9 +108,9 @@ def test_densities_are_those_of_the_times_that_are_asked_for():
     level, force = rng.normal(size=3), rng.normal(size=(1, 3, 2, 1))
     for times in (np.array([14.0, 16.0]), np.array([20.0, 29.0])):
         predicted = xr.Dataset({"forces": (("chain", "draw", "time", "force"), force)}, {"time": times})
-        found = log_densities(bound, {"level": level}, predicted, HELD_OUT)
+        result = log_densities(bound, {"level": level}, predicted, HELD_OUT)
         rate = np.exp(level[:, None] + 0.1 * times + force[0, ..., 0])
-        np.testing.assert_allclose(found[..., 0], stats.poisson.logpmf(HELD_OUT[:, 0], rate), rtol=1e-12)
+        np.testing.assert_allclose(result[..., 0], stats.poisson.logpmf(HELD_OUT[:, 0], rate), rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -130,8 +130,8 @@ def test_check_by_importance_sampling_and_correction(result):
 
 
 def test_leave_one_out_comparison(result):
-    found = az.loo(result)
-    total = getattr(found, "elpd_loo", None) or found.elpd
+    computed = az.loo(result)
+    total = getattr(computed, "elpd_loo", None) or computed.elpd
     assert np.isfinite(total) and total < 0
 
 
@@ -140,8 +140,8 @@ def test_unconverged_sites_are_counted_and_named(result):
     kept = json.loads(arviz_data.attributes(result)["site_failures"])
     assert kept == [100, 0, 0] and not any("sites" in said for said in arviz_data.convergence_warnings(result))
     bound = lfm.bind(counts, TIMES, COUNTS, sites=SiteSettings(sweeps=9))
-    found = site_failures(bound, 2.0 * np.random.default_rng(0).normal(size=(1, 50, 2)))
-    assert 0 < found.unconverged < found.points and found.unconverged <= found.impossible
+    computed = site_failures(bound, 2.0 * np.random.default_rng(0).normal(size=(1, 50, 2)))
+    assert 0 < computed.unconverged < computed.points and computed.unconverged <= computed.impossible
     result.attrs["site_failures"] = json.dumps([100, 7, 9])
     said = arviz_data.convergence_warnings(result)[-1]
     assert "at 7 of 100 points a step away from the draws (7%), and the likelihood is zero at 9 of the 100: dr" in said
@@ -163,9 +163,9 @@ def test_a_panel_of_counts_is_a_loop_over_its_series():
     y = np.stack([COUNTS, np.full_like(COUNTS, np.nan)])
     y[0, 3] = np.nan
     panel = lfm.panel(lambda level: system(level, 0.6), jnp.array([0.3, 0.8]), TIMES)
-    found = panel.log_prob(y)
-    assert found[0] == pytest.approx(float(lfm.MarginalLikelihood(system(0.3, 0.6), TIMES).log_prob(y[0])), abs=1e-9)
-    assert found[1] == pytest.approx(0.0, abs=1e-12)
+    result = panel.log_prob(y)
+    assert result[0] == pytest.approx(float(lfm.MarginalLikelihood(system(0.3, 0.6), TIMES).log_prob(y[0])), abs=1e-9)
+    assert result[1] == pytest.approx(0.0, abs=1e-12)
 
 
 def driven(times, y=None):

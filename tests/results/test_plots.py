@@ -31,14 +31,14 @@ PALETTE = {*OKABE_ITO, style.GREY}
 
 def line(axes, colour, *, dashed=False):
     """The one line of that colour."""
-    (found,) = [
+    (result,) = [
         one
         for one in axes.lines
         if to_hex(one.get_color()).upper() == colour
         and one.is_dashed() is dashed
         and one.get_linestyle() != "None"
     ]
-    return found
+    return result
 
 
 def points(axes, marker):

@@ -57,8 +57,8 @@ def test_lags_of_an_output_that_few_rows_have_count_its_observations():
     dense = np.random.default_rng(1).normal(size=40)
     sparse = np.full(120, np.nan)
     sparse[::3] = dense
-    for found, expected in zip(autocorrelation(sparse, 8), autocorrelation(dense, 8), strict=True):
-        np.testing.assert_allclose(found, expected)
+    for result, expected in zip(autocorrelation(sparse, 8), autocorrelation(dense, 8), strict=True):
+        np.testing.assert_allclose(result, expected)
     assert ljung_box(sparse, 8) == pytest.approx(ljung_box(dense, 8))
 
 

@@ -53,18 +53,18 @@ def test_scores_of_a_mixture():
     y = RNG.normal(size=(3, 2))
     y[1, 0] = np.nan
     dataset = predicted(mean, sd)
-    found = lfm.score(dataset, y)
+    result = lfm.score(dataset, y)
     density = stats.norm.pdf(y, mean, sd).mean(axis=0)
     error = y - mean.mean(axis=0)
-    assert found.index.tolist() == ["a", "b", "all"]
-    assert found.columns.tolist() == ["n", "rmse", "crps", "log_score", "coverage_95"]
-    assert found["n"].tolist() == [2, 3, 5]
-    np.testing.assert_allclose(found["log_score"], [np.nanmean(np.log(density[:, 0])), np.log(density[:, 1]).mean(),
+    assert result.index.tolist() == ["a", "b", "all"]
+    assert result.columns.tolist() == ["n", "rmse", "crps", "log_score", "coverage_95"]
+    assert result["n"].tolist() == [2, 3, 5]
+    np.testing.assert_allclose(result["log_score"], [np.nanmean(np.log(density[:, 0])), np.log(density[:, 1]).mean(),
                                                     np.nanmean(np.log(density))])
-    np.testing.assert_allclose(found["rmse"], [np.sqrt(np.nanmean(error[:, 0] ** 2)),
+    np.testing.assert_allclose(result["rmse"], [np.sqrt(np.nanmean(error[:, 0] ** 2)),
                                                np.sqrt(np.mean(error[:, 1] ** 2)), np.sqrt(np.nanmean(error**2))])
     ranked = scoring.crps(dataset["y"].values[0], y)
-    np.testing.assert_allclose(found.loc["a", "crps"], np.nanmean(ranked[:, 0]))
+    np.testing.assert_allclose(result.loc["a", "crps"], np.nanmean(ranked[:, 0]))
     low, high = mixture_quantiles(mean, sd, [0.25, 0.75])
     for ends, p in ((low, 0.25), (high, 0.75)):
         np.testing.assert_allclose(stats.norm.cdf(ends, mean, sd).mean(axis=0), p, atol=1e-8)
@@ -76,8 +76,8 @@ def test_scores_of_a_mixture():
 def test_quantiles_of_a_mixture_with_one_part_far_away():
     mean, sd = np.zeros((400, 1)), np.full((400, 1), 0.01)
     sd[0] = 1000.0
-    (found,) = mixture_quantiles(mean, sd, 0.025, 1e-4)[0]
-    np.testing.assert_allclose(stats.norm.cdf(found, mean, sd).mean(), 0.025, atol=1e-5)
+    (result,) = mixture_quantiles(mean, sd, 0.025, 1e-4)[0]
+    np.testing.assert_allclose(stats.norm.cdf(result, mean, sd).mean(), 0.025, atol=1e-5)
 
 
 def test_summaries_of_a_panel_with_normal_parts_and_with_points():
@@ -87,21 +87,21 @@ def test_summaries_of_a_panel_with_normal_parts_and_with_points():
         size=(*lead, 8, *where, 1))
     dims = ("chain", "draw", "series", "at")
     paths = xr.Dataset({"states": ((*dims, "state"), mean), "outputs": ((*dims, "output"), points[..., 0, :, :])})
-    found = with_summaries(paths, {"state_mean": mean, "state_sd": sd, "output_points": points})
-    assert found["states_summary"].dims == ("statistic", "series", "at", "state")
-    high = found["states_summary"].sel(statistic="q97.5").values
+    result = with_summaries(paths, {"state_mean": mean, "state_sd": sd, "output_points": points})
+    assert result["states_summary"].dims == ("statistic", "series", "at", "state")
+    high = result["states_summary"].sel(statistic="q97.5").values
     np.testing.assert_allclose(stats.norm.cdf(high, mean, sd).mean(axis=(0, 1)), 0.975, atol=1e-5)
     low = np.quantile(points, 0.025, axis=(0, 1, 3))
-    np.testing.assert_allclose(found["outputs_summary"].sel(statistic="q2.5"), low, rtol=1e-12)
-    np.testing.assert_allclose(found["outputs_summary"].sel(statistic="mean"), points.mean(axis=(0, 1, 3)), rtol=1e-12)
-    assert "new_data_summary" not in found and "forces_summary" not in found
+    np.testing.assert_allclose(result["outputs_summary"].sel(statistic="q2.5"), low, rtol=1e-12)
+    np.testing.assert_allclose(result["outputs_summary"].sel(statistic="mean"), points.mean(axis=(0, 1, 3)), rtol=1e-12)
+    assert "new_data_summary" not in result and "forces_summary" not in result
 
 
 def test_draws_alone_have_no_log_score():
     dataset = predicted(np.zeros((2000, 3, 2)), 1.0)[["y"]]
-    found = lfm.score(dataset, np.zeros((3, 2)))
-    assert np.isnan(found["log_score"]).all()
-    assert (found["coverage_95"] == 1).all()
+    result = lfm.score(dataset, np.zeros((3, 2)))
+    assert np.isnan(result["log_score"]).all()
+    assert (result["coverage_95"] == 1).all()
 
 
 def test_held_out_data_are_found_by_time_and_name():
@@ -118,9 +118,9 @@ def test_angles_are_compared_on_the_circle():
     mean = np.full((200, 3, 2), np.pi)
     draws = (mean + 0.1 * RNG.normal(size=mean.shape) + np.pi) % (2 * np.pi) - np.pi  # on both sides of the cut
     dataset = predicted(mean, 0.1, draws, angular='["a"]')
-    found = lfm.score(dataset, np.array([[-np.pi + 0.05, np.pi]] * 3))
-    np.testing.assert_allclose(found.loc["a", "rmse"], 0.05)
-    assert found.loc["a", "crps"] < 0.06 < 0.5 < found.loc["b", "crps"]  # b is no angle
+    result = lfm.score(dataset, np.array([[-np.pi + 0.05, np.pi]] * 3))
+    np.testing.assert_allclose(result.loc["a", "rmse"], 0.05)
+    assert result.loc["a", "crps"] < 0.06 < 0.5 < result.loc["b", "crps"]  # b is no angle
 
 
 @pytest.mark.parametrize(("held_out", "message"), [

@@ -23,8 +23,8 @@ from lfm_ppl.utils import calendar_time
 ])
 def test_the_unit_follows_the_time_between_rows(gap, unit):
     stamps = [datetime(2020, 2, 3, 5) + k * timedelta(**gap) for k in range(4)]
-    times, origin, found = calendar_time.since_midnight(stamps)
-    assert (found, origin) == (unit, "2020-02-03T00:00:00")
+    times, origin, result = calendar_time.since_midnight(stamps)
+    assert (result, origin) == (unit, "2020-02-03T00:00:00")
     seconds = [(stamp - datetime(2020, 2, 3)).total_seconds() for stamp in stamps]
     np.testing.assert_allclose(times * calendar_time.SECONDS[unit], seconds, rtol=1e-15)
 
@@ -157,14 +157,14 @@ def test_dates_as_times_are_fitted_as_a_table_of_dates():
     y = np.sin(np.arange(8.0) / 5)[:, None]
     later = pd.date_range("2026-01-05 15:00", periods=2, freq="h")
     table = lfm.fit(model, pd.DataFrame(y, hours, ["x"]), at=later, **OPTIONS)
-    found = lfm.fit(model, hours, y, at=later.to_pydatetime(), **OPTIONS)
+    computed = lfm.fit(model, hours, y, at=later.to_pydatetime(), **OPTIONS)
     plain = lfm.fit(model, np.arange(6.0, 14.0), y, at=[15.0, 16.0], **OPTIONS)
-    for result in (table, found):
+    for result in (table, computed):
         assert result.attrs["time_origin"] == "2026-01-05T00:00:00"
         assert result["observed_data"]["time"].attrs["units"] == "h"
         for group, name in (("posterior", "rate"), ("predictions", "y"), ("observed_data", "time")):
             np.testing.assert_array_equal(result[group][name], plain[group][name])
-    ahead = lfm.forecast(found, model, later, draws=5, progress=False)
+    ahead = lfm.forecast(computed, model, later, draws=5, progress=False)
     expected = lfm.forecast(plain, model, [15.0, 16.0], draws=5, progress=False)
     np.testing.assert_array_equal(ahead["predictions"]["y"], expected["predictions"]["y"])
     held_out = Data(later, [[0.5], [0.6]], ("y0",), {"time": "min"})  # on a clock of its own

@@ -58,8 +58,8 @@ def test_derivatives_of_products(shapes):
             return jax.jvp(lambda *x: (function(*x) ** 2).sum(), x, directions)[1]
         return [total(*x), *jax.grad(total, tuple(range(len(x))))(*x)]
 
-    def symmetrised(found):
-        return [part + np.swapaxes(part, -1, -2) if np.shape(part) == p.shape else part for part in found]
+    def symmetrised(result):
+        return [part + np.swapaxes(part, -1, -2) if np.shape(part) == p.shape else part for part in result]
 
     cases = [(congruence, plain, (a, p), (change, change_of_p)),
              (lambda a: congruence(a, p), lambda a: plain(a, p), (a,), (change,)),
@@ -67,8 +67,8 @@ def test_derivatives_of_products(shapes):
              (outer_square, lambda a: a @ jnp.swapaxes(a, -1, -2), (a,), (change,))]
     for ours, theirs, x, directions in cases:
         # The gradient in a symmetric matrix is known up to an antisymmetric part.
-        for found, expected in zip(*(symmetrised(slope(f, x, directions)) for f in (ours, theirs)), strict=True):
-            assert np.allclose(found, expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max(initial=1.0))
+        for result, expected in zip(*(symmetrised(slope(f, x, directions)) for f in (ours, theirs)), strict=True):
+            assert np.allclose(result, expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max(initial=1.0))
 
 
 def test_derivatives_of_a_congruence_off_symmetry():
@@ -166,8 +166,8 @@ def at_once(p, floor, keep):
 def derivatives(factorise, keep, root, live, weights, floor):
     def value(z):
         scaled = root * (1.0 + z[0] * jnp.arange(5.0)) + 0.3 * z[1] * live[:, None]
-        found = factorise(outer_square(scaled), floor * (1.0 + z[2]), keep)
-        return sum((weight * jnp.tril(matrix)).sum() for weight, matrix in zip(weights, found, strict=True))
+        result = factorise(outer_square(scaled), floor * (1.0 + z[2]), keep)
+        return sum((weight * jnp.tril(matrix)).sum() for weight, matrix in zip(weights, result, strict=True))
 
     z = jnp.array([0.1, 0.2, 0.3])
     grad = jax.grad(value)
@@ -184,8 +184,8 @@ def test_derivatives_of_a_factor_are_those_of_its_operations(keep, floor, dead):
     weights = np.random.default_rng(1).normal(size=(2, 4, 4))
 
     both = (derivatives(f, keep, root, live, weights, np.array(floor)) for f in (at_once, by_columns))
-    for found, expected in zip(*both, strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12 * np.abs(expected).max())
+    for result, expected in zip(*both, strict=True):
+        np.testing.assert_allclose(result, expected, rtol=1e-11, atol=1e-12 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("indices", [(0, 1, 2), (2,), (2, 0), (1, -1, 2, 3), (-1, -1, 0)])

@@ -88,8 +88,8 @@ def test_the_reference_is_the_last_season_with_the_spread_of_its_changes():
     y = data()
     y = np.where(np.isnan(y), 0.0, y)
     y[2, 1] = np.nan
-    found = lfm.backtest(motif.model, TIMES, y, horizon=3, first=5, season=2, model_kwargs={"spread": NEAR})
-    naive = found.scores.sel(forecaster="seasonal-naive").isel(origin=0)
+    result = lfm.backtest(motif.model, TIMES, y, horizon=3, first=5, season=2, model_kwargs={"spread": NEAR})
+    naive = result.scores.sel(forecaster="seasonal-naive").isel(origin=0)
     for output, rows in ((0, (3, 4, 3)), (1, (3, 4, 3))):
         np.testing.assert_array_equal(naive["mean"][:, output], y[list(rows), output])
     for lead, lag in ((1, 2), (2, 2), (3, 4)):

@@ -242,14 +242,14 @@ def test_loo_equals_refitting_without_each_observation(line, y, density):
         exact[row] = evidence(y) - evidence(without)
     import arviz as az
 
-    found = az.loo(line, pointwise=True)
-    pointwise = np.asarray(found.loo_i if hasattr(found, "loo_i") else found.elpd_i)
+    result = az.loo(line, pointwise=True)
+    pointwise = np.asarray(result.loo_i if hasattr(result, "loo_i") else result.elpd_i)
     # Standard error of the log of an importance-sampling mean of 1 / p(y_k | y_-k, theta), at the effective sample size
     inverse = np.exp(-group(line, "log_likelihood")["y"].values.reshape(4000, -1))
     size = arviz_data.ess(line)["decay"]
     error = inverse.std(0) / inverse.mean(0) / np.sqrt(size)
     np.testing.assert_array_less(np.abs(pointwise - exact), 4.5 * error + 1e-6)
-    total = float(found.elpd_loo if hasattr(found, "elpd_loo") else found.elpd)
+    total = float(result.elpd_loo if hasattr(result, "elpd_loo") else result.elpd)
     assert abs(total - exact.sum()) < 4.5 * error.sum()
     assert error.sum() < 0.2
 
@@ -340,10 +340,10 @@ def test_bands_are_the_quantiles_of_the_mixture_over_the_draws(nuts, y):
             start = 2 * len(TIMES)
             means.append(mean[start:start + len(FORECAST)])
             sds.append(np.sqrt(np.diag(covariance)[start:start + len(FORECAST)]))
-    found = paths["forces_summary"].sel(force="drive")
-    np.testing.assert_allclose(found.sel(statistic="mean"), np.mean(means, axis=0), rtol=1e-6, atol=1e-8)
+    result = paths["forces_summary"].sel(force="drive")
+    np.testing.assert_allclose(result.sel(statistic="mean"), np.mean(means, axis=0), rtol=1e-6, atol=1e-8)
     for p, name in ((0.025, "q2.5"), (0.975, "q97.5")):
-        share = stats.norm.cdf(found.sel(statistic=name).values, means, sds).mean(axis=0)
+        share = stats.norm.cdf(result.sel(statistic=name).values, means, sds).mean(axis=0)
         np.testing.assert_allclose(share, p, atol=1e-4)
 
 
@@ -355,13 +355,13 @@ def test_deterministics_follow_the_path_and_have_its_bands(known, y):
     # Its distribution is log-normal: quantiles of the logarithm, with the error of 8 points a draw.
     smoothed = lfm.smooth(motif.build(**motif.THETA), TIMES, y, at=FORECAST)
     mean, sd = (np.asarray(part) for part in smoothed.force("drive"))
-    found = np.log(paths["deterministics_summary"].sel(deterministic="rate"))
+    result = np.log(paths["deterministics_summary"].sel(deterministic="rate"))
     error = np.sqrt(0.025 * 0.975 / (8 * paths.sizes["draw"])) / stats.norm.pdf(stats.norm.ppf(0.025))
     for p, name in ((0.025, "q2.5"), (0.975, "q97.5")):
-        assert np.abs((found.sel(statistic=name) - mean) / sd - stats.norm.ppf(p)).max() < 4.5 * error
+        assert np.abs((result.sel(statistic=name) - mean) / sd - stats.norm.ppf(p)).max() < 4.5 * error
     expected = np.exp(mean + sd**2 / 2)
     error = expected * np.sqrt(np.expm1(sd**2) / (8 * paths.sizes["draw"]))
-    assert (np.abs(np.exp(found.sel(statistic="mean")) - expected) < 4.5 * error).all()
+    assert (np.abs(np.exp(result.sel(statistic="mean")) - expected) < 4.5 * error).all()
 
 
 def test_mode_of_known_parameters(known):

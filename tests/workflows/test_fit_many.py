@@ -28,9 +28,9 @@ def data_sets(count=3):
 
 
 def poisoned(count=3):
-    found = data_sets(count)
-    found["plant 1"] = (TIMES, np.full_like(found["plant 1"][1], np.inf))
-    return found
+    result = data_sets(count)
+    result["plant 1"] = (TIMES, np.full_like(result["plant 1"][1], np.inf))
+    return result
 
 
 def draws(result):
@@ -49,13 +49,13 @@ def test_each_result_is_that_of_a_fit(folder):
     _, fits, yielded = folder
     assert [one.name for one in yielded] == ["plant 0", "plant 1", "plant 2"] and len(fits) == 3
     own = lfm.fit(motif.model, *data_sets()["plant 2"], seed=fit_tasks.seed_of("plant 2"), progress=False, **OPTIONS)
-    found = yielded[2].result
-    assert arviz_data.groups(found) == arviz_data.groups(own)
+    result = yielded[2].result
+    assert arviz_data.groups(result) == arviz_data.groups(own)
     for name in arviz_data.groups(own):
-        one, other = arviz_data.group(own, name), arviz_data.group(found, name)
+        one, other = arviz_data.group(own, name), arviz_data.group(result, name)
         assert one.equals(other) and {k: v.attrs for k, v in one.variables.items()} == {
             k: v.attrs for k, v in other.variables.items()}, name
-    attrs, expected = arviz_data.attributes(found), arviz_data.attributes(own)
+    attrs, expected = arviz_data.attributes(result), arviz_data.attributes(own)
     assert json.loads(attrs.pop("warnings")) == json.loads(expected.pop("warnings")) == []
     for measured in ("wall_time_s", "created_at"):
         attrs.pop(measured), expected.pop(measured)
@@ -232,10 +232,18 @@ def test_several_processes_get_a_model_file(tmp_path, monkeypatch, capsys):
         assert code == 0
     one, other = (pd.read_csv(tmp_path / f"jobs-{jobs}" / "summary.csv") for jobs in (1, 2))
     pd.testing.assert_frame_equal(one, other, rtol=1e-12)
-    found = subprocess.run([sys.executable, "-m", "lfm_ppl", *"fit motif.py --sampler map --samples 20 --jobs 1 --data "
-                            "patients/*.csv --each --out jobs-2".split()], capture_output=True, text=True,
-                           env=os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"})
-    assert found.returncode == 0 and "3 of 3 tasks are stored already" in found.stderr, found.stderr
+    result = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "lfm_ppl",
+            *"fit motif.py --sampler map --samples 20 --jobs 1 --data patients/*.csv --each --out jobs-2".split(),
+        ],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"},
+    )
+    assert result.returncode == 0 and "3 of 3 tasks are stored already" in result.stderr, result.stderr
 
 
 def test_series_in_one_file(line, tmp_path):

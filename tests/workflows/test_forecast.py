@@ -55,20 +55,20 @@ def exact():
 
 def test_moments_of_a_linear_model_are_exact(ahead, exact):
     mean, covariance = exact
-    found = predictions(ahead)
+    result = predictions(ahead)
     free = np.sqrt(np.diag(covariance)).reshape(-1, 2)
-    np.testing.assert_allclose(found["y_mean"].values[0], np.tile(mean.reshape(-1, 2), (DRAWS, 1, 1)), atol=2e-6)
-    np.testing.assert_allclose(found["y_sd"][0, 0], np.hypot(free, motif.THETA["noise_sd"]), rtol=2e-6)
-    np.testing.assert_allclose(found["outputs_sd"][0, 0], free, rtol=2e-6)
-    low, high = noise_free_interval(found)
+    np.testing.assert_allclose(result["y_mean"].values[0], np.tile(mean.reshape(-1, 2), (DRAWS, 1, 1)), atol=2e-6)
+    np.testing.assert_allclose(result["y_sd"][0, 0], np.hypot(free, motif.THETA["noise_sd"]), rtol=2e-6)
+    np.testing.assert_allclose(result["outputs_sd"][0, 0], free, rtol=2e-6)
+    low, high = noise_free_interval(result)
     np.testing.assert_allclose(high - low, 2 * stats.norm.ppf(0.975) * free, rtol=1e-5)
 
 
 def test_new_data_of_a_linear_model_are_exact_jointly_in_time(ahead, exact):
     mean, covariance = exact
-    found = predictions(ahead)
+    result = predictions(ahead)
     for name, noise in (("outputs", 0.0), ("y", motif.THETA["noise_sd"] ** 2)):
-        draws = found[name].values[0].reshape(DRAWS, -1)
+        draws = result[name].values[0].reshape(DRAWS, -1)
         root = np.linalg.cholesky(covariance + (noise + 1e-12) * np.eye(len(mean)))
         white = np.linalg.solve(root, (draws - mean).T)
         assert np.abs(white.mean(axis=1)).max() < 4.5 / np.sqrt(DRAWS)
@@ -76,17 +76,17 @@ def test_new_data_of_a_linear_model_are_exact_jointly_in_time(ahead, exact):
 
 
 def test_groups_coordinates_and_words(ahead, known):
-    found = predictions(ahead)
+    result = predictions(ahead)
     assert "predictions" not in arviz_data.groups(known)  # a new object
     assert set(arviz_data.groups(ahead)) == {*arviz_data.groups(known), "predictions"}
-    assert found["y"].dims == ("chain", "draw", "time", "output")
-    assert found["forces"].dims == ("chain", "draw", "time", "force")
-    np.testing.assert_array_equal(found["time"], AT)
-    assert found["output"].values.tolist() == ["left", "right"]
-    assert found["y"].attrs == {"long_name": "new observation, with noise", "units": "nM"}
-    assert found["outputs"].attrs["long_name"] == "noise-free output"
-    assert found.attrs["last_observation"] == motif.TIMES[-1]
-    table = summary(found)
+    assert result["y"].dims == ("chain", "draw", "time", "output")
+    assert result["forces"].dims == ("chain", "draw", "time", "force")
+    np.testing.assert_array_equal(result["time"], AT)
+    assert result["output"].values.tolist() == ["left", "right"]
+    assert result["y"].attrs == {"long_name": "new observation, with noise", "units": "nM"}
+    assert result["outputs"].attrs["long_name"] == "noise-free output"
+    assert result.attrs["last_observation"] == motif.TIMES[-1]
+    table = summary(result)
     assert table.index.tolist() == np.repeat(AT, 2).tolist()
     wide, narrow = table["q97.5"] - table["q2.5"], table["noise_free_q97.5"] - table["noise_free_q2.5"]
     assert (wide > narrow).all()
@@ -96,10 +96,12 @@ def test_fit_at_times_gives_the_same_predictions_and_says_noise_free():
     result = lfm.fit(motif.model, motif.TIMES, motif.data(), sampler="map", samples=DRAWS, trajectory_draws=DRAWS,
                      at=AT, model_kwargs={"spread": NEAR}, progress=False)
     mean, _ = motif.posterior(motif.data(), AT, **motif.THETA)
-    found = predictions(result)
-    np.testing.assert_allclose(found["y_mean"].values[0, 0].ravel(), mean[2 * len(motif.TIMES) + len(AT):], atol=2e-6)
+    computed = predictions(result)
+    np.testing.assert_allclose(
+        computed["y_mean"].values[0, 0].ravel(), mean[2 * len(motif.TIMES) + len(AT) :], atol=2e-6
+    )
     paths = arviz_data.group(result, "trajectories")
-    np.testing.assert_array_equal(found["outputs"].values, paths["outputs"].values)
+    np.testing.assert_array_equal(computed["outputs"].values, paths["outputs"].values)
     assert paths["outputs"].attrs["long_name"] == "noise-free output"
 
 
@@ -125,7 +127,7 @@ def ahead_of_the_wells(between_the_wells):
 def test_after_the_data_a_nonlinear_model_has_its_own_distribution(between_the_wells, ahead_of_the_wells):
     """Two wells, as the Fokker-Planck equation has them; Gaussian moments would fill the gap between."""
     times, y, _ = between_the_wells
-    found = ahead_of_the_wells.isel(time=slice(3, None))
+    result = ahead_of_the_wells.isel(time=slice(3, None))
     model = systems.double_well(noise=0.0025, dispersion=DISPERSION)
     grid = lfm.fokker_planck(model, np.concatenate([times, LATER]), np.concatenate([y, np.full((2, 1), np.nan)]),
                              cells=500)
@@ -134,14 +136,14 @@ def test_after_the_data_a_nonlinear_model_has_its_own_distribution(between_the_w
     for k in range(2):
         mass = np.asarray(grid.filtered[3 + k])
         below = np.concatenate([[0.0], np.cumsum(mass) / mass.sum()])
-        distance = stats.kstest(found["states"].values[0, :, k, 0], lambda x, below=below: np.interp(x, edges, below))
+        distance = stats.kstest(result["states"].values[0, :, k, 0], lambda x, below=below: np.interp(x, edges, below))
         # Critical value at 0.1%, and 0.01 for the Gaussian at the last observation.
         bound = 1.95 / np.sqrt(DRAWS) + 0.01
         assert distance.statistic < bound
         moments = stats.norm.cdf(edges, gaussian.mean[k, 0], np.sqrt(gaussian.covariance[k, 0, 0]))
         assert np.abs(moments - below).max() > bound  # which the Gaussian moments, without any Monte Carlo error, miss
-        np.testing.assert_allclose(found["y_sd"], 0.05)
-        np.testing.assert_array_equal(found["y_mean"], found["outputs"])
+        np.testing.assert_allclose(result["y_sd"], 0.05)
+        np.testing.assert_array_equal(result["y_mean"], result["outputs"])
 
 
 def test_one_path_goes_through_the_last_observation(ahead_of_the_wells):
@@ -200,8 +202,8 @@ def test_a_known_input_must_reach_the_forecast():
     with pytest.raises(ValueError, match="input"):
         lfm.forecast(result, driven, [30.0], model_kwargs={"heat": short})
     longer = lfm.Input([*times, 4.0, 30.0], [1.0, 1.0, 1.0, 1.0, 7.0, 7.0], interpolation="previous", outside="error")
-    found = predictions(lfm.forecast(result, driven, [30.0], inputs={"heat": longer}))
-    np.testing.assert_allclose(found["y_mean"], 7.0, atol=1e-4)
+    computed = predictions(lfm.forecast(result, driven, [30.0], inputs={"heat": longer}))
+    np.testing.assert_allclose(computed["y_mean"], 7.0, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -215,12 +217,12 @@ def test_a_panel_is_forecast_series_by_series():
     times, y = np.array([0.0, 1.0, 2.0]), np.random.default_rng(0).normal(size=(2, 3, 1))
     result = lfm.fit(model, times, y, sampler="map", samples=30, trajectory_draws=0, progress=False)
     ahead = lfm.forecast(result, model, [3.0, 5.0])
-    found = predictions(ahead)
-    assert found["y"].dims == ("chain", "draw", "series", "time", "output")
+    computed = predictions(ahead)
+    assert computed["y"].dims == ("chain", "draw", "series", "time", "output")
     for series, decay in enumerate((0.5, 1.2)):
         system = motif.build(jnp.array([decay]), 1.5, 0.2)
         smoothed = lfm.smooth(system, times, y[series], at=np.array([3.0, 5.0]))
-        np.testing.assert_allclose(found["y_mean"].values[0, 0, series], smoothed.mean[:, :1], atol=1e-5)
+        np.testing.assert_allclose(computed["y_mean"].values[0, 0, series], smoothed.mean[:, :1], atol=1e-5)
     assert lfm.score(ahead, np.zeros((2, 2, 1))).loc["a", "n"] == 4
 
 
@@ -261,8 +263,8 @@ def test_bands_cover_new_data_over_200_runs(model):
             warnings.simplefilter("ignore", lfm.ConvergenceWarning)
             result = lfm.fit(model, times, past, sampler="nuts", chains=1, warmup=200, samples=400,
                              trajectory_draws=400, at=times, seed=index, progress=False)
-        found = predictions(result).isel(time=slice(known, None))
-        mean, sd = (found[name].values.reshape(-1, 10) for name in ("y_mean", "y_sd"))
+        computed = predictions(result).isel(time=slice(known, None))
+        mean, sd = (computed[name].values.reshape(-1, 10) for name in ("y_mean", "y_sd"))
         share = stats.norm.cdf((y[known:, 0] - mean) / sd).mean(axis=0)
         pit.append(share)
         covered.append((share > 0.025) & (share < 0.975))

@@ -66,8 +66,8 @@ def test_one_step_ahead_densities_are_those_of_the_exact_likelihood(converted):
     posterior = group(converted, "posterior").isel(chain=1, draw=7)
     theta = {"decay": posterior["decay"].values, "lengthscale": float(posterior["lengthscale"]),
              "noise_sd": float(posterior["noise_sd"])}
-    found = group(converted, "one_step_ahead")["log_density"].isel(chain=1, draw=7).sum()
-    np.testing.assert_allclose(found, motif.log_density(motif.data(), **theta), rtol=1e-7)
+    result = group(converted, "one_step_ahead")["log_density"].isel(chain=1, draw=7).sum()
+    np.testing.assert_allclose(result, motif.log_density(motif.data(), **theta), rtol=1e-7)
 
 
 def test_loo_sees_every_row_of_the_data(converted):
