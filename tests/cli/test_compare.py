@@ -50,7 +50,7 @@ def wanted(monkeypatch):
 
     real = catalogue.CatalogueEntry.study.fget
     monkeypatch.setattr(catalogue.CatalogueEntry, "study", property(
-        lambda entry: Fake(**{one.name: getattr(real(entry), one.name) for one in dataclasses.fields(Study)})))
+        lambda entry: Fake(**{field.name: getattr(real(entry), field.name) for field in dataclasses.fields(Study)})))
     return asked
 
 
@@ -128,9 +128,9 @@ def test_the_same_command_has_the_same_folder(run, wanted):
 def test_the_help_of_a_study_has_its_options_and_no_others(run, name):
     code, out, err = run(f"compare {name} --help")
     assert code == 0 and err == "" and f"options of {name}" in out
-    own = {flag for one in options(catalogue.experiment(name).study.settings) for flag in one.flags}
-    every = {flag for other in catalogue.names() for one in options(catalogue.experiment(other).study.settings)
-             for flag in one.flags}
+    own = {flag for option in options(catalogue.experiment(name).study.settings) for flag in option.flags}
+    every = {flag for name in catalogue.names() for option in options(catalogue.experiment(name).study.settings)
+             for flag in option.flags}
     assert "--seed" in own
     for flag in every:
         assert (f"{flag} " in out) == (flag in own), flag

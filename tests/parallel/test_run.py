@@ -126,7 +126,7 @@ def timed(task):
 @pytest.mark.parametrize("alike", [False, True])
 def test_where_tasks_are_alike_the_first_one_begins_by_itself(workers, alike):
     run_tasks(tasks(2), noise, None, workers=workers)  # both have imported what they need
-    first, *others = (one.result for one in outcomes(tasks(4), timed, None, workers=workers, alike=alike))
+    first, *others = (outcome.result for outcome in outcomes(tasks(4), timed, None, workers=workers, alike=alike))
     assert (min(one["began"] for one in others) > first["ended"]) is alike
 
 
@@ -139,7 +139,7 @@ def test_where_the_first_of_tasks_that_are_alike_fails_the_second_begins_by_itse
 
 def test_no_more_wait_for_the_first_one_than_a_minute(workers, monkeypatch):
     monkeypatch.setattr(cluster, "_ALONE_S", 0.0)
-    first, *others = (one.result for one in outcomes(tasks(4), timed, None, workers=workers, alike=True))
+    first, *others = (outcome.result for outcome in outcomes(tasks(4), timed, None, workers=workers, alike=True))
     assert min(one["began"] for one in others) < first["ended"]
 
 

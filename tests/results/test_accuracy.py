@@ -312,7 +312,7 @@ def test_densities_keep_to_the_support_and_their_mass_and_are_dashed_where_unrel
         np.testing.assert_allclose(np.trapezoid(density, grid), 1.0, atol=0.02)
         near = np.searchsorted(grid, 0.1)
         np.testing.assert_allclose(density[near], 2 * stats.norm.pdf(0.1), rtol=0.1)
-        (corrected,) = [one for one in axes.lines if one.get_linestyle() != "None" and len(one.get_xdata()) > 2]
+        (corrected,) = [line for line in axes.lines if line.get_linestyle() != "None" and len(line.get_xdata()) > 2]
         assert corrected.is_dashed() is dashed
         assert corrected.get_xdata().min() >= 0.0
 

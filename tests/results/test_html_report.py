@@ -163,8 +163,8 @@ def test_all_text_is_escaped(groups, attrs, tmp_path):
     for name, dataset in groups.items():
         for dim, new in names.items():
             if dim in dataset.coords:
-                groups[name] = groups[name].assign_coords({dim: [new.get(str(one), str(one))
-                                                                 for one in dataset[dim].values]})
+                groups[name] = groups[name].assign_coords({dim: [new.get(str(value), str(value))
+                                                                 for value in dataset[dim].values]})
     groups["posterior"] = groups["posterior"].rename({"decay": "d<b>"})
     groups["constant_data"] = groups["constant_data"].rename({"heater": "h<i>", "heater_time": "h<i>_time"})
     attrs |= dict.fromkeys(("model", "description", "data", "note", "command_line", "partial", "sampler", "own"), EVIL)

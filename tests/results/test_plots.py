@@ -32,17 +32,17 @@ PALETTE = {*OKABE_ITO, style.GREY}
 def line(axes, colour, *, dashed=False):
     """The one line of that colour."""
     (result,) = [
-        one
-        for one in axes.lines
-        if to_hex(one.get_color()).upper() == colour
-        and one.is_dashed() is dashed
-        and one.get_linestyle() != "None"
+        line
+        for line in axes.lines
+        if to_hex(line.get_color()).upper() == colour
+        and line.is_dashed() is dashed
+        and line.get_linestyle() != "None"
     ]
     return result
 
 
 def points(axes, marker):
-    return [one for one in axes.lines if one.get_marker() == marker]
+    return [line for line in axes.lines if line.get_marker() == marker]
 
 
 def edges(band):
@@ -55,7 +55,7 @@ def edges(band):
 
 
 def bands(axes):
-    return [one for one in axes.collections if isinstance(one, PolyCollection)]
+    return [collection for collection in axes.collections if isinstance(collection, PolyCollection)]
 
 
 def legend_texts(figure):
@@ -72,7 +72,7 @@ def test_readable_at_the_widths_of_a_paper(result, readable, plot, width):
     assert figure.get_figheight() < 10.0
     assert dict(matplotlib.rcParams) == before
     assert not plt.get_fignums()
-    for one in (one for axes in figure.axes for one in axes.lines):
+    for line in (line for axes in figure.axes for line in axes.lines):
         assert to_hex(one.get_color()).upper() in PALETTE
 
 
@@ -106,11 +106,11 @@ def test_forces_go_on_with_their_forecast(datasets):
         drawn = edges(bands(axes)[-1])
         low, high = np.quantile(ahead[..., index].reshape(-1, 40), (0.025, 0.975), axis=0)[:, later]
         np.testing.assert_allclose([drawn[x] for x in time[later]], np.stack([low, high], axis=-1))
-        (end,) = [one for one in axes.lines if np.array_equal(one.get_xdata(), [12.0, 12.0])]
+        (end,) = [line for line in axes.lines if np.array_equal(line.get_xdata(), [12.0, 12.0])]
         assert end.is_dashed()
     assert legend_texts(figure)[-1] == "last observation"
     few = arviz_data.build({**datasets, "predictions": predictions.isel(time=[0, -1])})
-    (bars,) = [one for one in plot_forces(few).axes[0].collections if isinstance(one, LineCollection)]
+    (bars,) = [collection for collection in plot_forces(few).axes[0].collections if isinstance(collection, LineCollection)]
     np.testing.assert_allclose(bars.get_segments()[0][:, 0], 30.0)
 
 
@@ -118,7 +118,7 @@ def test_the_truth_is_drawn_as_far_as_the_trajectories(datasets):
     at, truth = datasets["trajectories"]["at"].values, datasets["truth"]
     later = truth.assign_coords(at_truth=truth["at_truth"].values + 0.5 * np.ptp(at))
     for axes in plot_forces(arviz_data.build({**datasets, "truth": later})).axes:
-        (drawn,) = [one for one in axes.lines if one.get_color() == style.BLACK and one.is_dashed()]
+        (drawn,) = [line for line in axes.lines if line.get_color() == style.BLACK and line.is_dashed()]
         assert 0 < len(drawn.get_xdata()) < truth.sizes["at_truth"]
         assert at.min() <= drawn.get_xdata().min() and drawn.get_xdata().max() <= at.max()
 
@@ -207,7 +207,7 @@ def test_fit_draws_the_noise_free_truth(datasets):
         true = line(axes, style.BLACK, dashed=True)
         np.testing.assert_array_equal(true.get_xdata(), truth["at_truth"].values)
         np.testing.assert_array_equal(true.get_ydata(), outputs[:, column])
-    assert not [one for one in second.lines if one.is_dashed() and to_hex(one.get_color()) == style.BLACK]
+    assert not [line for line in second.lines if line.is_dashed() and to_hex(line.get_color()) == style.BLACK]
 
 
 def test_fit_of_chosen_outputs_and_without_predictive_draws(datasets):
@@ -265,7 +265,7 @@ def test_held_out_data_are_marked(datasets):
     datasets["held_out_data"] = xr.Dataset({"y": y}, named)
     figure = plot_fit(arviz_data.build(datasets))
     assert "held-out data" in legend_texts(figure)
-    (marks,) = [one for one in figure.axes[1].lines if to_hex(one.get_markerfacecolor()) == "#ffffff"]
+    (marks,) = [line for line in figure.axes[1].lines if to_hex(line.get_markerfacecolor()) == "#ffffff"]
     np.testing.assert_array_equal(marks.get_ydata(), [2.0, np.nan])
     np.testing.assert_array_equal(marks.get_xdata(), [13.0, 13.5])
 
@@ -444,8 +444,8 @@ def test_bars_of_residuals_are_drawn_whole(datasets):
     residual = datasets["one_step_ahead"]["residual"]
     seen = int(np.flatnonzero(residual.notnull().all(["chain", "draw"])[:, 0])[0])
     residual[:, ::2, seen, 0] = -9.0  # of half of the draws
-    (bars,) = [one for one in plot_residuals(arviz_data.build(datasets)).axes[0].collections
-               if isinstance(one, LineCollection)]
+    (bars,) = [collection for collection in plot_residuals(arviz_data.build(datasets)).axes[0].collections
+               if isinstance(collection, LineCollection)]
     ends = np.concatenate([segment[:, 1] for segment in bars.get_segments() if len(segment)])  # none where missing
     low, high = bars.axes.get_ylim()
     assert ends.min() == -9.0
