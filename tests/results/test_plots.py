@@ -73,7 +73,7 @@ def test_readable_at_the_widths_of_a_paper(result, readable, plot, width):
     assert dict(matplotlib.rcParams) == before
     assert not plt.get_fignums()
     for line in (line for axes in figure.axes for line in axes.lines):
-        assert to_hex(one.get_color()).upper() in PALETTE
+        assert to_hex(line.get_color()).upper() in PALETTE
 
 
 @pytest.mark.parametrize("width", ["column", "full"])
@@ -110,7 +110,8 @@ def test_forces_go_on_with_their_forecast(datasets):
         assert end.is_dashed()
     assert legend_texts(figure)[-1] == "last observation"
     few = arviz_data.build({**datasets, "predictions": predictions.isel(time=[0, -1])})
-    (bars,) = [collection for collection in plot_forces(few).axes[0].collections if isinstance(collection, LineCollection)]
+    collections = plot_forces(few).axes[0].collections
+    (bars,) = [collection for collection in collections if isinstance(collection, LineCollection)]
     np.testing.assert_allclose(bars.get_segments()[0][:, 0], 30.0)
 
 
