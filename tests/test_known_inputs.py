@@ -14,6 +14,7 @@ import xarray as xr
 import lfm_ppl as lfm
 from lfm_ppl.cli import description
 from lfm_ppl.cli import fit as command
+from lfm_ppl.cli.data_file import read_data
 from lfm_ppl.io import loading
 from lfm_ppl.io.data import write_csv
 from lfm_ppl.io.data_set import Data, InputTable
@@ -86,14 +87,14 @@ def test_the_command_line_reads_blank_cells_as_zero(folder, recwarn):
     (folder / "house.py").write_text(MODEL.replace('"power": "previous", "weather": "linear"', '"power": "zero"'))
     model = loading.load(str(folder / "house.py"))
     for inputs in ("dose_rate", "dose_rate:zero"):
-        data = command.read(str(folder / "doses.csv"), model, arguments(folder, outputs="conc", inputs=inputs))
+        data = read_data(str(folder / "doses.csv"), model, arguments(folder, outputs="conc", inputs=inputs))
         assert data.inputs["power"].values.tolist() == [100, 0, 0, 50, 0]
         assert data.inputs["power"].interpolation == "previous"
     assert not recwarn
     with pytest.warns(UserWarning, match="blank"):
-        command.read(str(folder / "doses.csv"), model, arguments(folder, outputs="conc", inputs="dose_rate:previous"))
+        read_data(str(folder / "doses.csv"), model, arguments(folder, outputs="conc", inputs="dose_rate:previous"))
     with pytest.raises(ValueError, match="zeros"):
-        command.read(str(folder / "doses.csv"), model, arguments(folder, outputs="conc", inputs="dose_rate:zeros"))
+        read_data(str(folder / "doses.csv"), model, arguments(folder, outputs="conc", inputs="dose_rate:zeros"))
 
 
 def test_the_command_line_maps_columns_to_the_model_s_names(folder):

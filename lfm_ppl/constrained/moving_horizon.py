@@ -64,6 +64,7 @@ class HorizonState(NamedTuple):
     covariance: jax.Array
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class HorizonEstimate:
     """Estimate of one window.

@@ -1,6 +1,7 @@
 """The backward scan: smoothed moments, leave-one-out terms and adjoints, from the trace of any forward pass.
 
-From the last interval to the first,
+The adjoint is the smoother's variable (r, Lambda) of Bryson and Frazier, the score and the information of all later
+observations; it has nothing to do with automatic differentiation. From the last interval to the first,
 
 1. take in the observation at the interval's end: the adjoint (r, Lambda) there, and the law of that observation given
    all others. With u = S^-1 v - K' r and C = S^-1 + K' Lambda K it is N(y - C^-1 u, C^-1);

@@ -70,7 +70,7 @@ def minimum_sd(dynamics: Dynamics, factor: IntegratingFactor, t: jax.Array, h: j
         scale = jnp.abs(moments.mean) + jnp.concatenate([change, forces])
     else:
         outputs = jnp.sqrt(diagonal(congruence(matrix[size:, size:], factor.force_cov_full)) + 1e-300)
-        scale = (jnp.abs(w) + jnp.concatenate([change, outputs]))[jnp.asarray(ssm.drift_structure.points, int)]
+        scale = (jnp.abs(w) + jnp.concatenate([change, outputs]))[jnp.asarray(ssm.drift_structure.nonlinear, int)]
     scale = jnp.where(jnp.isfinite(scale), scale, 0.0)
     return checkpoint_name(jax.lax.stop_gradient(1e-6 * scale + 1e-150), MINIMUM_SD)
 
@@ -100,8 +100,8 @@ def linearize(ssm: StateSpaceModel, rule: Rule, function: Function, structure: I
             return function(matvec(matrix, s) + offset)
 
         return rule.linearise(function_of_state, inputs, full_structure, jnp.zeros((jacobian.shape[0], total)))
-    nonlinear = (*structure.points, *structure.averaged)
-    needs_covariance = isinstance(rule, SigmaPointRule) and bool(structure.points)
+    nonlinear = (*structure.nonlinear, *structure.averaged)
+    needs_covariance = isinstance(rule, SigmaPointRule) and bool(structure.nonlinear)
     rows = matmul(selection(nonlinear, ssm.input_dim).T, matrix) if nonlinear else matrix[:0]
     reads_forces_only = all(index >= ssm.physical_dim for index in nonlinear)
     nonlinear_covariance = covariance(rows, reads_forces_only) if needs_covariance else jnp.zeros((0, 0))
@@ -151,7 +151,7 @@ def is_nonlinear_in_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
     uses_full_state = isinstance(rule, SigmaPointRule) and rule.full_state
     structure = ssm.drift_structure
     return not uses_full_state and all(
-        index >= ssm.physical_dim for index in (*structure.points, *structure.averaged))
+        index >= ssm.physical_dim for index in (*structure.nonlinear, *structure.averaged))
 
 
 def is_autonomous(ssm: StateSpaceModel) -> bool:
@@ -165,7 +165,7 @@ def linearization_indices(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:
     if isinstance(rule, SigmaPointRule) and rule.full_state:
         return np.arange(ssm.state_dim)
     structure = ssm.drift_structure
-    is_needed = np.isin(np.arange(ssm.input_dim), (*structure.points, *structure.averaged))
+    is_needed = np.isin(np.arange(ssm.input_dim), (*structure.nonlinear, *structure.averaged))
     size = ssm.physical_dim
     forces = [np.full(force.state_dim, flag) for force, flag in zip(ssm.stack.forces, is_needed[size:], strict=True)]
     return np.flatnonzero(np.concatenate([is_needed[:size], *forces]))

@@ -8,8 +8,8 @@ For each interval of the time grid, in one fused scan,
 4. update the moments by an `Updater`: a Gaussian observation, Gaussian sites, or sites by moment matching;
 5. record what the caller asks for (`Record`).
 
-The body of the scan is checkpointed: of each interval, the derivative stores its inputs and a few numbers that take
-many operations.
+The body of the scan is checkpointed, which matters in reverse mode only: of each interval, the derivative stores its
+inputs and a few numbers that take many operations.
 
 Source: Särkkä and Sarmavuori (2013), Signal Processing 93, section 3.
 """
@@ -45,7 +45,7 @@ from lfm_ppl.filtering.update import (
 from lfm_ppl.utils.linalg import matmul
 
 _STORED = jax.checkpoint_policies.save_only_these_names(MINIMUM_SD, UPDATE_FAILED, INNOVATION_FACTOR)
-"""What the derivative of an interval stores besides its inputs."""
+"""What reverse mode stores of an interval besides its inputs."""
 
 
 class LinearizationPoints(NamedTuple):

@@ -1,7 +1,8 @@
 r"""Iterated posterior linearisation: smooth, linearise about the smoothed marginals, repeat.
 
 1. A first pass is linearised about the filter's own moments.
-2. An adjoint scan gives the smoothed moments at the ends of all integration steps (`smoothed_points`).
+2. The backward scan of Bryson and Frazier's adjoint, the variable (r, Lambda) of the smoother and not that of automatic
+   differentiation, gives the smoothed moments at the ends of all integration steps (`smoothed_points`).
 3. Each further pass is linearised about them, damped: where an iteration moves the means m of a time by r and the one
    before, of which the fraction s was taken, moved them by r', the fraction that is taken now is that of the secant
    method,
@@ -9,6 +10,10 @@ r"""Iterated posterior linearisation: smooth, linearise about the smoothed margi
        s / (1 - lambda),    lambda = sum_i r_i r'_i / v_i  /  sum_i r'_i^2 / v_i,
 
    with the variances v, and at most the damping: means that alternate between two values meet between them.
+4. The caller makes the final forward pass about the result: n iterations are n forward and n backward scans, and one
+   forward scan more.
+
+The gradient is that of the unrolled iterations, since a fixed number of them is a smooth function of the parameters.
 
 Source: García-Fernández, Svensson and Särkkä (2017), IEEE Transactions on Signal Processing 65(21).
 """
@@ -67,7 +72,7 @@ def posterior_linearisation(problem: FilterProblem, updater: Updater, iterations
     Args:
         problem: the model, the rule and the time grid.
         updater: how observations update the moments.
-        iterations: number of passes.
+        iterations: number of forward and backward scans.
         damping: largest fraction of the new marginals that is taken, in (0, 1].
         initial: moments at the initial time; None: the model's.
     """

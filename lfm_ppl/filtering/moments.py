@@ -33,13 +33,20 @@ class Prediction(NamedTuple):
 
 
 class Record(enum.Enum):
-    """Output of a forward pass, each with all of the one before it.
+    """Output of a forward pass: the fields of `FilterTrace` that it fills.
 
-    LIKELIHOOD: log likelihoods.
-    MOMENTS: and predicted and filtered moments and innovations.
-    LINEARIZATION: and what the adjoint scan and the next linearization points need: gains, transition matrices, and
-        the moments of the linearized states at the ends of the integration steps.
-    SMOOTHER: instead of the steps, the noise of each interval.
+    ============== ============== ========================= ================= =================== ==============
+    record         log likelihood predicted, filtered,      gain, transition  nodes: moments at   process noise
+                                  innovation                matrices          ends of steps       of intervals
+    ============== ============== ========================= ================= =================== ==============
+    LIKELIHOOD     yes
+    MOMENTS        yes            yes
+    LINEARIZATION  yes            yes                       yes               yes
+    SMOOTHER       yes            yes                       yes                                   yes
+    ============== ============== ========================= ================= =================== ==============
+
+    LINEARIZATION is for the backward scan of the smoother's adjoint and the next linearization points of iterated
+    posterior linearisation, SMOOTHER for smoothed moments and trajectories.
     """
 
     LIKELIHOOD = "likelihood"

@@ -83,7 +83,8 @@ def runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, span: Span, 
     phi2, m2 = add_increment(to_half, 0.5 * h * matmul(half[:size, :size], k1))
 
     def process_cov_at_stage2() -> jax.Array:
-        return process_cov_at(factor, 0, phi2[:size][None], stack_diffusions(stage1), jnp.reshape(0.5 * h, 1), size)
+        return process_cov_at(factor, 0, phi2[:size][None], stack_diffusions(stage1.diffusion),
+                              jnp.reshape(0.5 * h, 1), size)
 
     stage2 = linearize_stage(1, span.time(0.5 * h), m2,
                              _propagated_covariance(p, phi2, process_cov_at_stage2, factor.force_cov_half, size))
@@ -94,7 +95,8 @@ def runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, span: Span, 
     transport3 = identity[:size] + matmul(_increment_after(phi3[:size] - half_x, phi3, z2, size), back_half)
 
     def process_cov_at_stage3() -> jax.Array:
-        return process_cov_at(factor, 1, transport3[None], stack_diffusions(stage2), jnp.reshape(0.5 * h, 1), size)
+        return process_cov_at(factor, 1, transport3[None], stack_diffusions(stage2.diffusion),
+                              jnp.reshape(0.5 * h, 1), size)
 
     stage3 = linearize_stage(1, span.time(0.5 * h), m3,
                              _propagated_covariance(p, phi3, process_cov_at_stage3, factor.force_cov_half, size))
@@ -105,7 +107,7 @@ def runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, span: Span, 
     transport4 = half_x + matmul(_increment_after(phi4[:size] - full_x, phi4, z3, size), back_half)
 
     def process_cov_at_stage4() -> jax.Array:
-        return process_cov_at(factor, 2, transport4[None], stack_diffusions(stage3), jnp.reshape(h, 1), size)
+        return process_cov_at(factor, 2, transport4[None], stack_diffusions(stage3.diffusion), jnp.reshape(h, 1), size)
 
     covariance4 = _propagated_covariance(p, phi4, process_cov_at_stage4, factor.force_cov_full, size)
     stage4 = linearize_stage(2, span.time(h), m4, covariance4)
@@ -118,16 +120,16 @@ def runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, span: Span, 
     transports = jnp.stack([phi[:size], half_x + matmul(_increment_after(change, phi, z2, size), back_half),
                             half_x + matmul(_increment_after(change, phi, z3, size), back_half),
                             identity[:size] + matmul(_increment_after(change, phi, z4, size), back_full)])
-    diffusions = stack_diffusions(stage1, stage2, stage3, stage4)
+    diffusions = stack_diffusions(*(stage.diffusion for stage in (stage1, stage2, stage3, stage4)))
     process_cov = process_cov_at(factor, -1, transports, diffusions, h * WEIGHTS, size)
     moments = Moments(mean, congruence(phi, p) + process_cov)
     return Prediction(moments, phi, process_cov), FourthStage(stage4, covariance4(identity, False))
 
 
-def stack_diffusions(*stages: DriftLinearization) -> jax.Array | None:
-    """Return the diffusions (K, M, M) of the stages; None without process noise."""
-    diffusions = [stage.diffusion for stage in stages if stage.diffusion is not None]
-    return jnp.stack(diffusions) if diffusions else None
+def stack_diffusions(*diffusions: jax.Array | None) -> jax.Array | None:
+    """Return the diffusions of K stages as (K, M, M); None without process noise, where all of them are None."""
+    present = [diffusion for diffusion in diffusions if diffusion is not None]
+    return jnp.stack(present) if present else None
 
 
 def _propagated_covariance(p: jax.Array, phi: jax.Array, process_cov: Callable[[], jax.Array], force_cov: jax.Array,

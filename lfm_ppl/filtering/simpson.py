@@ -42,7 +42,10 @@ class _Node(NamedTuple):
 
 
 class StepMap(NamedTuple):
-    """The affine map of one step: s -> phi s + (offset, 0) + N(0, process_cov); offset is (M,)."""
+    """The affine map of one step about the mean m at its start, with the transition E(h) of the linear part.
+
+    It is s -> E(h) m + (offset, 0) + phi (s - m) + N(0, process_cov), with an offset (M,).
+    """
 
     phi: jax.Array
     offset: jax.Array
@@ -69,7 +72,8 @@ def step_maps(dynamics: Dynamics, factor: IntegratingFactor, steps: int, span: S
     point = forces if about is None else jax.tree.map(insert_midpoints, _forces_of(about, size))
 
     def linearize_node(t: jax.Array, mean: jax.Array, point: Moments) -> _Node:
-        centre = jnp.concatenate([jnp.zeros(size), point.mean])  # the physical state drops out
+        # The drift without its constant linear part does not depend on the physical state here: any value will do.
+        centre = jnp.concatenate([jnp.zeros(size), point.mean])
 
         def covariance(rows: jax.Array, reads_forces_only: bool) -> jax.Array:
             return congruence(rows[:, size:], point.covariance)
@@ -157,7 +161,7 @@ def _simpson_step(factor: IntegratingFactor, h: jax.Array, nodes: tuple[_Node, .
     backward = jnp.stack([factor.back_half, factor.back_half, factor.back_full])[:, size:, size:]
     nonlinear = jnp.concatenate([jacobian[None], matmul(jacobian - matmul(full_x, inverse), backward)])
     transports = jnp.concatenate([linear[:, :, :size], linear[:, :, size:] + nonlinear], axis=2)
-    stages = [DriftLinearization(node.remainder, node.remainder, node.diffusion) for node in nodes]
-    diffusions = stack_diffusions(stages[0], stages[1], stages[1], stages[2])
+    start, midpoint, end = (node.diffusion for node in nodes)
+    diffusions = stack_diffusions(start, midpoint, midpoint, end)
     process_cov = process_cov_at(factor, -1, transports, diffusions, h * WEIGHTS, size)
     return StepMap(jnp.concatenate([transports[0], full[size:]]), offset, process_cov)

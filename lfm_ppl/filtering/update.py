@@ -208,7 +208,7 @@ def _minimum_sd(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments
     if isinstance(rule, SigmaPointRule) and rule.full_state:
         scale = moments.mean
     else:
-        scale = ssm.inputs(moments.mean, t)[jnp.asarray(ssm.observation_structure.points, int)]
+        scale = ssm.inputs(moments.mean, t)[jnp.asarray(ssm.observation_structure.nonlinear, int)]
     # For a state that is exactly zero and known, any unit is as good as another.
     return jax.lax.stop_gradient(1e-6 * jnp.where(scale == 0, 1e-3, jnp.abs(scale)))
 

@@ -172,7 +172,7 @@ class MarginalLikelihood(SeriesLikelihood):
         if not self.is_family:
             return ""
         settings = self.site_settings
-        is_linear = not (self.ssm.drift_structure.points or self.ssm.observation_structure.points)
+        is_linear = not (self.ssm.drift_structure.nonlinear or self.ssm.observation_structure.nonlinear)
         return settings.method + ("" if is_linear else f", linearised at most {settings.relinearisations} times")
 
     def log_prob(self, value: Any) -> jax.Array:
@@ -181,12 +181,12 @@ class MarginalLikelihood(SeriesLikelihood):
         if value.ndim > 2:
             return jax.vmap(self.log_prob)(value)
         check_resolution(self.model, self.times, value)
-        # One failure makes the sum -inf, and the derivatives of all other terms zero.
         y = self.checked(value)
         has_converged: Any = True
         if self.is_family:
             log_likelihood, has_converged = finite_or_minus_infinity(self._evidence_and_convergence, y)
         else:
+            # The guard is around the sum: one failure makes it -inf, and the derivatives of all other terms zero.
             log_likelihood = finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y)
         warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood, self.site_settings,
                           has_converged)

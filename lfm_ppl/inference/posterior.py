@@ -110,7 +110,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         at = None
     example = bound.site.example
     is_forecast = None
-    if particles is None and not isinstance(example, ConstrainedLikelihood) and example.ssm.drift_structure.points:
+    if particles is None and not isinstance(example, ConstrainedLikelihood) and example.ssm.drift_structure.nonlinear:
         is_forecast = _has_forecast(bound, at)
     plan = _plan(bound, at, particles is not None or is_forecast is not None,
                  _first_simulated_time(bound) if is_forecast else -np.inf)
@@ -340,7 +340,7 @@ def noise_of_rows(distribution: SeriesLikelihood) -> bool:
 def _normal_outputs(ssm: StateSpaceModel) -> bool:
     """Return whether y is normal where the state is: a linear observation with noise that does not depend on it."""
     observation = ssm.model.observation
-    return not (ssm.observation_structure.points or observation.varies_with_state or observation.angular)
+    return not (ssm.observation_structure.nonlinear or observation.varies_with_state or observation.angular)
 
 
 def _particle_path(distribution: SeriesLikelihood, y: jax.Array, requested_times: Any, key: jax.Array,

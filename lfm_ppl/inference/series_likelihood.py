@@ -79,6 +79,7 @@ class SeriesLikelihood(dist.Distribution):
         """The time grid of the scan."""
         return build_time_grid(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
 
+    # Not cached: it is computed from traced parameters, inside the function that `finite_or_minus_infinity` guards.
     @property
     def problem(self) -> FilterProblem:
         """The filter problem: model, rule and time grid, with what all intervals share."""
@@ -179,6 +180,10 @@ class SeriesLikelihood(dist.Distribution):
         return check_observations(y, count, outputs, model=self.model)
 
     def _one_step_ahead(self, y: jax.Array) -> jax.Array:
+        """Return (T,): log p(y_k | y_1:k-1), after posterior linearisation where there are iterations.
+
+        An observation family has those of the assumed density filter.
+        """
         problem, updater, points = self.problem, GaussianUpdate(y), None
         if self.is_family:
             return assumed_density_filter(problem, y).log_likelihood

@@ -299,7 +299,7 @@ def _check_model(ssm: StateSpaceModel) -> None:
         raise ValueError("the state is a function of the forces only without process_noise; use the particle "
                          "smoother, lfm.particle_smoother, instead.")
     varying = [name for index, name in enumerate(model.state_names)
-               if index in ssm.drift_structure.points or index in ssm.drift_structure.averaged]
+               if index in ssm.drift_structure.nonlinear or index in ssm.drift_structure.averaged]
     if varying:
         raise ValueError(f"the dynamics must be linear in the state with constant coefficients, but their derivative "
                          f"in {', '.join(varying)} varies; use the particle smoother, lfm.particle_smoother, instead.")

@@ -82,17 +82,17 @@ class SigmaPointRule(Rule):
     def linearise(self, function: Function, inputs: Inputs, structure: InputStructure,
                   jacobian: jax.Array) -> AffineMap:
         """See `Rule.linearise`."""
-        if not structure.points:
+        if not structure.nonlinear:
             return _linearise_without_points(function, inputs, structure, jacobian)
-        unit = self.points(len(structure.points))
+        unit = self.points(len(structure.nonlinear))
         nodes, weights = jnp.asarray(unit.nodes), jnp.asarray(unit.weights)
-        count, size = len(structure.points), inputs.mean.shape[0]
+        count, size = len(structure.nonlinear), inputs.mean.shape[0]
         factor = cholesky(inputs.covariance[:count, :count], inputs.min_sd**2)
         chol = factor.chol
         # Conditional mean of the averaged inputs given the node xi: m_r + gain xi with gain = P_ra L^-T.
         gain = _times_inverse_transpose(factor, inputs.covariance[count:, :count])
         root = jnp.concatenate([chol, gain]) if structure.averaged else chol
-        input_root = matmul(selection((*structure.points, *structure.averaged), size), root)
+        input_root = matmul(selection((*structure.nonlinear, *structure.averaged), size), root)
         sigma_points = inputs.mean + matmul(nodes, input_root.T)
         values, extras = jax.vmap(function)(sigma_points)
         value = (weights[:, None] * values).sum(0)
@@ -107,9 +107,9 @@ class SigmaPointRule(Rule):
             regression = matmul((weights[:, None] * values).T, nodes)
             slope = _times_inverse(factor, regression - averaged_regression)
         else:
-            _, slope = _average_jacobian(function, sigma_points, weights, structure.points)
+            _, slope = _average_jacobian(function, sigma_points, weights, structure.nonlinear)
             regression = matmul(slope, chol) + averaged_regression
-        jacobian = jacobian + matmul(slope, selection(structure.points, size).T)
+        jacobian = jacobian + matmul(slope, selection(structure.nonlinear, size).T)
         errors = values - value - matmul(nodes, regression.T)
         residual = matmul(matmul(errors.T, jnp.asarray(unit.residual_weights)), errors)
         if jacobians is not None:

@@ -10,15 +10,15 @@ class InputStructure:
     """The use that a function makes of its inputs w = (x, u), as static index tuples.
 
     Attributes:
-        points: non-linear inputs, in which a rule places its points.
-        averaged: inputs that are linear given the points, with a Jacobian that depends on the points or on time; a
+        nonlinear: non-linear inputs; a sigma-point rule places its points in these coordinates only.
+        averaged: inputs that are linear given the non-linear ones, with a Jacobian that depends on those or on time; a
             rule averages it.
         constant: linear inputs with a constant Jacobian.
         jacobian: (D, M + R) Booleans, whether an output depends on an input.
         offset_varies: whether the function depends explicitly on time.
     """
 
-    points: tuple[int, ...]
+    nonlinear: tuple[int, ...]
     averaged: tuple[int, ...]
     constant: tuple[int, ...]
     jacobian: tuple[tuple[bool, ...], ...]
@@ -27,4 +27,4 @@ class InputStructure:
     @property
     def linear(self) -> bool:
         """Whether the function is linear in w with a constant Jacobian."""
-        return not (self.points or self.averaged)
+        return not (self.nonlinear or self.averaged)

@@ -27,7 +27,7 @@ class Taylor(Rule):
                   jacobian: jax.Array) -> AffineMap:
         """See `Rule.linearise`."""
         value, extra = function(inputs.mean)
-        varying = (*structure.points, *structure.averaged)
+        varying = (*structure.nonlinear, *structure.averaged)
         if varying:
             varying_jacobian = partial_jacobian(function, inputs.mean, varying)
             jacobian = jacobian + matmul(varying_jacobian, selection(varying, inputs.mean.shape[0]).T)

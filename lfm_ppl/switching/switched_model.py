@@ -143,9 +143,9 @@ def check_linear(ssm: StateSpaceModel, rule: SwitchingRule) -> None:
     require_gaussian(ssm, "the Rao-Blackwellised particle filter", "lfm.particle_filter")
     names = (*ssm.model.state_names, *ssm.model.force_names)
     for label, structure in (("dynamics", ssm.drift_structure), ("observation", ssm.observation_structure)):
-        if structure.points:
-            raise ValueError(f"the {label} is not linear in {names[structure.points[0]]!r}, so that the state is not "
-                             "Gaussian given the discrete input. Use lfm.simulate_switched, which draws whole states.")
+        if structure.nonlinear:
+            raise ValueError(f"the {label} is not linear in {names[structure.nonlinear[0]]!r}, so that the state is "
+                             "not Gaussian given the discrete input. Use lfm.simulate_switched, which draws whole states.")
     size = len(names)
     hessian = pattern(lambda v: rule.reading(*ssm.split(v[:size]), v[size]), size + 1).hessian[:size, :size]
     if hessian.any():

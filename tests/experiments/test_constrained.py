@@ -147,11 +147,11 @@ def store_results(folder, settings):
         if kind == "transcription":
             path = np.abs(random.normal(size=(3, len(problem.TIMES))))
             result = {"truth": path[0]}
-            for method, (_, parameters, spacing, _) in estimators.METHODS.items():
-                result |= {f"{method}/mse": random.uniform(1e-3, 1e-2, count), f"{method}/minimum": np.zeros(count),
-                           f"{method}/coverage": np.full(count, 0.95), f"{method}/failed": np.zeros(count, bool),
-                           f"hyperparameters/{parameters}": np.ones((count, 2)),
-                           f"{method}/first": np.sort(path, axis=0)[[1, 0, 2], ::spacing]}
+            for label, method in estimators.METHODS.items():
+                result |= {f"{label}/mse": random.uniform(1e-3, 1e-2, count), f"{label}/minimum": np.zeros(count),
+                           f"{label}/coverage": np.full(count, 0.95), f"{label}/failed": np.zeros(count, bool),
+                           f"hyperparameters/{method.hyperparameters}": np.ones((count, 2)),
+                           f"{label}/first": np.sort(path, axis=0)[[1, 0, 2], ::method.every]}
         elif kind == "ballistic":
             paths = random.normal(size=(3, len(problem.TARGET_TIMES)))
             result = {"rmse": random.uniform(size=(count, 3)), "converged": np.ones(count, bool), "estimate": paths,

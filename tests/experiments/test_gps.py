@@ -111,7 +111,7 @@ def test_a_gap_at_the_end_of_training_refuses_one_satellite(data, monkeypatch):
         monkeypatch.setattr(module, "fit_orbit", lambda around, times, positions, solar=None: orbits.Orbit(
             0.0, orbits.deterministic.polynomial_state(times, positions)[0], 100.0, 0.0))
     task = experiment.learning_tasks(experiment.GpsSettings(data="folder", satellites=("G01",)))[0]
-    assert "G01: the start of an orbit is taken from its first 9 positions; there are 6" in str(
+    assert "G01: the start of an orbit needs 9 positions; there are 6" in str(
         compute(task)["refused"])
 
 

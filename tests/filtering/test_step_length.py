@@ -29,7 +29,7 @@ def longest(model, times=TIMES, **keywords):
 
 def test_the_longest_step_is_at_most_twice_the_median_step():
     assert longest(system()) <= 0.05 * (1 + 1e-12)
-    assert longest(system(), at=np.array([40.0])) <= 0.05 * (1 + 1e-12)
+    assert longest(system(), requested_times=np.array([40.0])) <= 0.05 * (1 + 1e-12)
     assert longest(system(), max_step=0.7) > 0.5
     assert longest(system(), tolerance=1e-3) == 1.2
     # The transitions of a linear model are exact.

@@ -34,9 +34,9 @@ def structure(points, averaged=(), constant=()):
 
 
 def linearise(rule, function, where, slope=None, covariance=COVARIANCE, outputs=2):
-    chosen = list((*where.points, *where.averaged))
+    chosen = list((*where.nonlinear, *where.averaged))
     inputs = Inputs(jnp.asarray(MEAN), jnp.asarray(covariance[np.ix_(chosen, chosen)]),
-                    1e-6 * jnp.ones(len(where.points)))
+                    1e-6 * jnp.ones(len(where.nonlinear)))
     slope = jnp.zeros((outputs, 4)) if slope is None else slope
     return rule.linearise(lambda v: (function(v), function(v) ** 2), inputs, where, slope)
 

@@ -21,7 +21,7 @@ def structure(dynamics, size, forces=("u",), **options):
         lfm.Gaussian(jnp.ones(size), jnp.eye(size)), **options)
     result = lfm.state_space(model).drift_structure
     names = (*model.state_names, *model.force_names)
-    return ({names[i] for i in result.points}, {names[i] for i in result.averaged}, {names[i] for i in result.constant})
+    return tuple({names[i] for i in indices} for indices in (result.nonlinear, result.averaged, result.constant))
 
 
 def ballistic(x, u, t):

@@ -98,7 +98,7 @@ def test_an_orbit_is_found_again(around):
         orbits.fit_orbit(around, TIMES, np.where(np.arange(97)[:, None] < 5, y, np.nan))
     with pytest.raises(ValueError, match="in its first 6 hours"):
         orbits.fit_orbit(around, TIMES, np.where(np.arange(97)[:, None] > 60, y, np.nan))
-    with pytest.raises(ValueError, match="must begin with"):
+    with pytest.raises(ValueError, match="must start at"):
         orbits.propagate(around, orbit, TIMES + 1.0)
 
 
@@ -109,7 +109,7 @@ def test_points_are_placed_in_position_and_velocity_alone(around, axes, states):
     ssm = state_space(orbits.satellite(around, start, orbits.small_forces(axes), axes, white=0.1))
     assert ssm.state_dim == states
     wanted = (0, 1, 2) if axes == "DYB" else (0, 1, 2, 3, 4, 5)
-    assert tuple(ssm.drift_structure.points) == wanted
+    assert tuple(ssm.drift_structure.nonlinear) == wanted
 
 
 @pytest.mark.parametrize(("axes", "turns"), [("DYB", 1), ("RTN", 2)])
@@ -156,7 +156,7 @@ def test_start_of_an_orbit_from_positions(around):
     holes[[2, 5]] = np.nan
     near = np.abs(orbits.start_near(TIMES, holes).mean - START)
     assert near[:3].max() < 1e-9 and near[3:].max() < 0.1 * orbits.START_SD[1]
-    for missing, message in (([0], "the first one is missing"), ([2, 3, 4, 5, 6], "nine take 3.25 h")):
+    for missing, message in (([0], "the first position is missing"), ([2, 3, 4, 5, 6], "nine take 3.25 h")):
         holes = truth[:, :3].copy()
         holes[missing] = np.nan
         with pytest.raises(ValueError, match=message):

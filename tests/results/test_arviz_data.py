@@ -177,7 +177,7 @@ def test_other_tools_read_the_file(tmp_path, result):
 def test_save_never_overwrites_unasked(tmp_path):
     first, second = draws_only(np.zeros((2, 4))), draws_only(np.ones((2, 4)))
     path = arviz_data.save(first, tmp_path / "posterior.nc")
-    with pytest.raises(FileExistsError, match=r"exists already.*overwrite=True"):
+    with pytest.raises(FileExistsError, match=r"already exists.*overwrite=True"):
         arviz_data.save(second, path)
     assert arviz_data.group(arviz_data.load(path), "posterior")["theta"].values.max() == 0.0
     arviz_data.save(second, path, overwrite=True)

@@ -40,7 +40,7 @@ def test_nothing_is_overwritten_unasked(tmp_path, datasets):
     states = datasets["trajectories"].drop_dims(["force", "output"])
     result = arviz_data.build({"trajectories": states})
     (tmp_path / "states.pdf").write_text("mine")
-    with pytest.raises(FileExistsError, match=r"states\.pdf exists already"):
+    with pytest.raises(FileExistsError, match=r"states\.pdf already exists"):
         save_figures(result, tmp_path, ("png", "pdf"))
     assert os.listdir(tmp_path) == ["states.pdf"]
     save_figures(result, tmp_path, ("png", "pdf"), overwrite=True)

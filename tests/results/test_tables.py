@@ -127,7 +127,7 @@ def test_csv_keeps_full_precision(tmp_path, result):
     pd.testing.assert_frame_equal(
         pd.read_csv(path, index_col="parameter"), frame, check_names=False, rtol=1e-15
     )
-    with pytest.raises(FileExistsError, match="exists already"):
+    with pytest.raises(FileExistsError, match="already exists"):
         write_csv(frame, path)
     write_csv(frame.iloc[:1], path, overwrite=True)
     assert len(path.read_text().splitlines()) == 2

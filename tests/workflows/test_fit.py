@@ -129,7 +129,7 @@ def test_what_a_truth_says_of_something_else_is_told(y):
     assert all(message.endswith("It is left out of the figures.") for message in told)
     with pytest.warns(UserWarning, match="unknown entry of the truth 'state_'. Did you mean 'state'"):
         assert checked_truth(bound, {"state_": 0, "parameters": {}}, Labels.of(bound)) == {"parameters": {}}
-    with pytest.raises(ValueError, match="the truth does not fit together: \"times\" must be"):
+    with pytest.raises(ValueError, match="the truth is inconsistent: \"times\" must be"):
         checked_truth(bound, {"times": 3.0}, Labels.of(bound))
     assert unplaced(bound, {"parameters": motif.THETA}, Labels.of(bound)) == []
 
