@@ -145,7 +145,8 @@ def check_linear(ssm: StateSpaceModel, rule: SwitchingRule) -> None:
     for label, structure in (("dynamics", ssm.drift_structure), ("observation", ssm.observation_structure)):
         if structure.nonlinear:
             raise ValueError(f"the {label} is not linear in {names[structure.nonlinear[0]]!r}, so that the state is "
-                             "not Gaussian given the discrete input. Use lfm.simulate_switched, which draws whole states.")
+                             "not Gaussian given the discrete input. Use lfm.simulate_switched, which draws whole "
+                             "states.")
     size = len(names)
     hessian = pattern(lambda v: rule.reading(*ssm.split(v[:size]), v[size]), size + 1).hessian[:size, :size]
     if hessian.any():

@@ -67,7 +67,14 @@ def residuals(order, delta, parameters):
     return np.sqrt(weights) * (rational(order, parameters, omega) - exact) / (exact + delta)
 
 
-def fitted(order, last):
+def fit(order, delta, parameters):
+    """Least-squares fit of the constants from given ones."""
+    with np.errstate(over="ignore", divide="ignore"):
+        return least_squares(lambda p: residuals(order, delta, p), parameters, method="lm", xtol=1e-14, ftol=1e-14,
+                             gtol=1e-14, max_nfev=4000).x
+
+
+def fit_from_taylor(order, last):
     """The constants of the library from nothing: delta is lowered to ``last``, from the poles of the Taylor form."""
     roots = np.roots([0.5**k / factorial(k) for k in range(order, -1, -1)])
     poles = -np.sqrt(-roots.astype(complex))
@@ -75,18 +82,26 @@ def fitted(order, last):
     zeros = np.array([-0.95 + 7.69j, -1.58 + 9.87j, -2.21 + 11.62j])[: order // 2 - 1]
     parameters = logarithms(1.0, poles[poles.imag >= 0.0], zeros)
     for delta in [d for d in (1e-2, 1e-3, 1e-4, 1e-5) if d > last] + [last]:
-        with np.errstate(over="ignore"):
-            parameters = least_squares(lambda p, d=delta: residuals(order, d, p), parameters, method="lm", xtol=1e-14,
-                                       ftol=1e-14, gtol=1e-14, max_nfev=4000).x
+        parameters = fit(order, delta, parameters)
     return parameters
 
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_constants_are_those_of_the_fit(order):
-    delta = _FITS[order].delta
-    result, expected = fitted(order, delta), stored(order)
-    costs = [(residuals(order, delta, p) ** 2).sum() for p in (result, expected)]
-    assert_allclose(costs[1], costs[0], rtol=1e-6)
+    """No fit is better, and a fit from constants that are 1% off returns to them.
+
+    With another rounding, of another processor, the long way from the Taylor form ends in another minimum for order 7.
+    """
+    delta, expected = _FITS[order].delta, stored(order)
+
+    def cost(parameters):
+        return (residuals(order, delta, parameters) ** 2).sum()
+
+    assert cost(expected) <= cost(fit_from_taylor(order, delta)) * (1 + 1e-6)
+    is_free = np.isfinite(expected)
+    shifted = expected + np.where(is_free, 0.01 * np.random.default_rng(order).normal(size=expected.size), 0.0)
+    result = fit(order, delta, np.where(is_free, shifted, -30.0))
+    assert_allclose(cost(result), cost(expected), rtol=1e-6)
     omega = np.linspace(0.0, 12.0, 121)
     assert_allclose(rational(order, result, omega), rational(order, expected, omega), rtol=1e-5, atol=1e-5 * delta)
 
