@@ -156,7 +156,7 @@ def test_start_of_an_orbit_from_positions(around):
     holes[[2, 5]] = np.nan
     near = np.abs(orbits.start_near(TIMES, holes).mean - START)
     assert near[:3].max() < 1e-9 and near[3:].max() < 0.1 * orbits.START_SD[1]
-    for missing, message in (([0], "the first position is missing"), ([2, 3, 4, 5, 6], "nine take 3.25 h")):
+    for missing, message in (([0], "the first position is missing"), ([2, 3, 4, 5, 6], "nine positions span 3.25 h")):
         holes = truth[:, :3].copy()
         holes[missing] = np.nan
         with pytest.raises(ValueError, match=message):

@@ -36,7 +36,7 @@ def group(result, name):
 @pytest.fixture(scope="module")
 def mcmc():
     # A walk compiles in less than NUTS, which the docstring's example runs.
-    run = MCMC(lfm.RAM(model), num_warmup=30, num_samples=20, num_chains=2, **QUIET)
+    run = MCMC(lfm.RAM(model), num_warmup=100, num_samples=60, num_chains=2, **QUIET)
     run.run(jax.random.key(0), motif.TIMES, jnp.asarray(motif.data()), extra_fields=("accept_prob", "potential_energy"))
     return run
 
