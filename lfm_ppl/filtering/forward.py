@@ -154,6 +154,7 @@ def forward(problem: FilterProblem, updater: Updater, *, initial: Moments | None
                                    nodes=prediction.nodes)
         return updated.moments, trace
 
+    # The data enter here: each field of the updater, a row for each observation, gets a row for each interval.
     rows = jax.tree.map(lambda a: with_observations(grid.intervals, a)[1], updater.rows())
     inputs = as_arrays(grid.intervals), rows, about, maps
     trace = jax.lax.scan(jax.checkpoint(step, prevent_cse=False, policy=_STORED), start, inputs)[1]

@@ -2,8 +2,8 @@
 
 1. `linearize_observation` gives the observation as an affine map of the state.
 2. An `Updater` turns that map, the row's data and the predicted moments into an `Update`: `GaussianUpdate` conditions
-   on a Gaussian observation, `SiteUpdate` multiplies with given sites, and `ep.moment_matching` makes the sites of a
-   row from its prediction.
+   on a Gaussian observation, `SiteUpdate` multiplies with given sites, and `MomentMatchingUpdate` of
+   `lfm_ppl.filtering.ep.moment_matching` computes the sites of a row from its prediction.
 3. Covariances are in Joseph's form. The log likelihood is -inf where the innovation covariance is not positive definite
    to working precision, or where the filtered moments of an output are rounding errors.
 

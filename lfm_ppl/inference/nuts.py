@@ -78,7 +78,8 @@ def nuts(bound: BoundModel, num_warmup: int, options: Mapping[str, Any]) -> Samp
     log_density_gradient = bound.gradient(bool(options.pop("forward_mode_differentiation")))
 
     def kernel_at(y: Any, **mass_matrix: Any) -> NUTS:
-        # NUTS differentiates the potential in either mode; each time it gets the gradient of the traced program.
+        # NumPyro differentiates the potential in reverse mode. A custom derivative gives it the gradient of the traced
+        # program, which is in forward mode for few parameters and is compiled once for all chains and blocks.
         @jax.custom_jvp
         def log_density(z: jax.Array) -> jax.Array:
             return bound.log_density(z, y)

@@ -212,7 +212,7 @@ def _cholesky_unrolled_jvp(name: str | None, primals: tuple, tangents: tuple) ->
     p, floor = primals
     p_tangent, floor_tangent = tangents
     factor = _cholesky_unrolled(name, p, floor)
-    if name is not None:
+    if name is not None:  # here and not in the primal, since only a derivative has something to store
         factor = jax.tree_util.tree_map(lambda a: checkpoint_name(a, name), factor)
     chol, degenerate, inverse = factor
     weight = np.tri(len(p)) - 0.5 * np.eye(len(p))

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rules import RULES
 from systems import Motif, Oscillator, double_well, first_state, identity, motif, softplus, whole_state
 
 import lfm_ppl as lfm
@@ -186,9 +187,7 @@ def test_a_long_gap_in_one_row_and_in_a_thousand():
     same(whole.log_likelihood, cut.log_likelihood[-1:], 1e-4)
 
 
-@pytest.mark.parametrize("rule", [lfm.Taylor(), lfm.Cubature(), lfm.Cubature(full_state=True), lfm.GaussHermite(4),
-                                  lfm.CentralDifference(), lfm.MonteCarlo(20), lfm.Unscented()],
-                         ids=lambda rule: rule.name)
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_rules_agree_on_a_linear_model(rule):
     model = motif(identity, variance=0.1)
     same(moments_of(lfm.filter(model, TIMES, Y, rule=rule)), moments_of(lfm.filter(model, TIMES, Y)), 1e-10)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from references import LinearLFM, Regression, gauss_hermite, matern
+from rules import RULES
 from systems import Kicked, Linear, Outputs, double_well, first_state, identity, motif, softplus
 
 import lfm_ppl as lfm
@@ -76,9 +77,7 @@ def bearing(x, u, t):
     return jnp.arctan2(x[1:], x[:1])
 
 
-@pytest.mark.parametrize("rule", [lfm.Taylor(), lfm.Cubature(), lfm.Cubature(full_state=True), lfm.Unscented(),
-                                  lfm.GaussHermite(5), lfm.CentralDifference(), lfm.MonteCarlo(20)],
-                         ids=lambda rule: rule.name)
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_angles_are_averaged_on_the_circle(rule):
     """A bearing next to the branch cut at pi, and the same picture turned by half a circle."""
 
