@@ -182,7 +182,7 @@ class SeriesLikelihood(dist.Distribution):
     def _one_step_ahead(self, y: jax.Array) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1), after posterior linearisation where there are iterations.
 
-        An observation family has those of the assumed density filter.
+        The terms of an observation family come from the assumed density filter.
         """
         problem, updater, points = self.problem, GaussianUpdate(y), None
         if self.is_family:
