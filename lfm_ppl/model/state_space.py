@@ -3,9 +3,9 @@
 1. Each force is a linear SDE. The joint state s = (x, z) stacks the physical state x and the states z of all forces.
 2. The functions f and h of the model take the inputs w = (x, u) = K(t) s + k(t), where K contains the measurement rows
    and k the means of the forces.
-3. `state_space` detects the structure of f and h from their jaxprs (`lfm_ppl.model.structure`). An input is a point if
-   f is non-linear in it, averaged if its Jacobian varies, and constant otherwise.
-4. Where several inputs enter through products only, a greedy choice leaves as few of them as possible to the points.
+3. `state_space` detects the structure of f and h from their jaxprs (`lfm_ppl.model.structure`). An input is non-linear
+   if f is non-linear in it, averaged if its Jacobian varies, and constant otherwise.
+4. Where several inputs enter through products only, a greedy choice makes as few of them as possible non-linear.
 5. `Span` evaluates functions of time on the inner side of an interval's ends, where they may jump.
 6. `check_times` checks the observation times.
 
