@@ -56,6 +56,7 @@ _VARIED = ("alpha", "beta", "scale", "gamma", "psi")
 _METER_ERROR, _FUNCTIONS = 1e-3, 15
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Window:
     """Five days of a home.
