@@ -50,7 +50,11 @@ _HARMLESS = 1e-6
 
 
 class LinearizedObservation(NamedTuple):
-    """An observation as an affine map of the state: y ~ value + jacobian (s - point) + N(0, obs_cov)."""
+    """An observation as an affine map of the state: y ~ value + jacobian (s - point) + N(0, obs_cov).
+
+    ``obs_cov`` is the covariance of the linearisation's residual and, for a Gaussian observation, of its noise. For an
+    observation family the map is that of the predictor, without noise.
+    """
 
     value: jax.Array
     jacobian: jax.Array
@@ -102,6 +106,9 @@ class SiteTerms(NamedTuple):
 class Update(NamedTuple):
     """Filtered moments and what the smoother and the diagnostics need.
 
+    An update returns either ``chol``, ``obs_cov`` and ``present`` (as `condition` does for Gaussian noise) or
+    ``site_terms`` (as `multiply_by_sites` does; an updater that has sites calls it and replaces the log likelihood).
+
     Attributes:
         moments: given the observation.
         log_likelihood: log density of the observation's present entries, given the past.
@@ -126,17 +133,28 @@ class Update(NamedTuple):
 
 
 RowUpdate = Callable[[LinearizedObservation, jax.Array, Any, Moments], Update]
-"""Maps a linearised observation, the row's index, its data and the predicted moments to an `Update`."""
+"""Maps a linearised observation, the row's index, its data and the predicted moments to an `Update`.
+
+The index is for parameters of a row, such as its covariance; it is 0 in an interval without an observation.
+"""
 
 
 class Updater(Protocol):
     """How observations update the predicted moments."""
 
     def rows(self) -> Any:
-        """Return the data of all rows, a pytree of arrays (T, ...); intervals without an observation get NaN."""
+        """Return the data of all rows, a pytree of arrays (T, ...).
+
+        They become floats, and NaN in intervals without an observation: a scale of the noise is masked before its use.
+        """
 
     def bind(self, problem: FilterProblem, initial: Moments) -> RowUpdate:
-        """Return the update of one row, with what all rows share."""
+        """Return the update of one row, with what all rows share.
+
+        Args:
+            problem: the filter problem.
+            initial: moments at the initial time, which give the scales of the outputs.
+        """
 
 
 class GaussianUpdate(NamedTuple):

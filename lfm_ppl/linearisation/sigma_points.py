@@ -34,6 +34,9 @@ from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import CholeskyFactor, cholesky, congruence, matmul, outer_square
 
+_MOST_POINTS = 10_000
+"""Largest number of points of a rule: its residual weights, a square matrix, then take 0.8 GB."""
+
 
 class UnitPoints(NamedTuple):
     """Nodes and weights of a rule for N(0, I) in ``dim`` dimensions.
@@ -42,7 +45,9 @@ class UnitPoints(NamedTuple):
         nodes: (p, dim), the nodes ``xi``.
         weights: (p,), weights ``w`` of expectations and regression, with ``sum w = 1``, ``sum w xi = 0`` and
             ``sum w xi xi' = I``.
-        residual_weights: (p, p), symmetric ``W``; the residual covariance is ``E' W E`` for residuals E (p, D).
+        residual_weights: (p, p), symmetric ``W``; the residual covariance is ``E' W E`` for residuals E (p, D). W must
+            be positive semi-definite, or the residual covariance may be negative: where weights are negative, diag(w)
+            is not, and another quadrature of the residuals is needed (`CentralDifference` shows one).
     """
 
     nodes: np.ndarray
@@ -238,7 +243,7 @@ class GaussHermite(SigmaPointRule):
 
     def points(self, dim: int) -> UnitPoints:
         """See `SigmaPointRule.points`."""
-        if self.order**dim > 200_000:
+        if self.order**dim > _MOST_POINTS:
             raise ValueError(f"GaussHermite({self.order}) in {dim} dimensions has {self.order}^{dim} points; use "
                              "lfm.Cubature() or lfm.Unscented(), whose number of points is linear in the dimension.")
         nodes_1d, weights_1d = np.polynomial.hermite_e.hermegauss(self.order)
