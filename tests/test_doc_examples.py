@@ -45,3 +45,10 @@ def test_examples_beat_the_reference_as_the_page_says(name, output):
         assert result[label] == pytest.approx(row, abs=0.02), label
     origins, rmse, _, log_score = result[output]
     assert origins == 10 and rmse >= 8 and log_score >= 8
+
+
+@pytest.mark.slow
+def test_the_code_for_numpyro_and_arviz_users_runs():
+    path = EXAMPLES / "numpyro_arviz.py"
+    run = subprocess.run([sys.executable, path], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "elpd_loo" in run.stdout and "('decay', 'lengthscale')" in run.stdout

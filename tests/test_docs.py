@@ -57,9 +57,10 @@ def test_local_links_and_included_files_exist():
     for page in DOCS.rglob("*.md"):
         whole = page.read_text("utf-8")
         text = re.sub(r"^```.*?^```$|`[^`]+`", "", whole, flags=re.MULTILINE | re.DOTALL)
-        included = [DOCS / name for name in re.findall(r'--8<-- "(.+)"', whole)]
+        snippets = re.findall(r'--8<-- "([^:"]+)', whole)
+        assert all((DOCS / name).is_file() or (ROOT / name).is_file() for name in snippets), page
         linked = [page.parent / link for link in re.findall(r"\]\(([^)#:]+)[^):]*\)", text)]
-        for path in (*included, *linked):
+        for path in linked:
             name = path.resolve().relative_to(DOCS).as_posix()
             made = re.fullmatch(r"gallery/(.+?)(_\d+\.png|\.md)", name)
             assert path.is_file() or made and made[1] in NOTEBOOKS, f"{page}: {name}"

@@ -13,9 +13,15 @@ _BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.DOT
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Replace what pymdownx.arithmatex has marked; called by MkDocs for each page."""
-    content = _BLOCK.sub(lambda found: f'<div class="formula">{_mathml(found[1], "block")}</div>', content)
-    return _INLINE.sub(lambda found: _mathml(found[1], "inline"), content)
+    """Replace the formulas that pymdownx.arithmatex has marked; called by MkDocs for each page."""
+    content = _BLOCK.sub(_block, content)
+    return _INLINE.sub(lambda match: _mathml(match[1], "inline"), content)
+
+
+def _block(match: re.Match[str]) -> str:
+    """Return a displayed formula; the equations between ``\\qquad`` may stand in lines of their own."""
+    equations = "".join(_mathml(equation, "block") for equation in match[1].split(r"\qquad"))
+    return f'<div class="formula">{equations}</div>'
 
 
 def _mathml(latex: str, display: str) -> str:

@@ -29,8 +29,7 @@ class WienerVelocity(Force):
     Args:
         scale: square root of the rate at which the variance of the velocity grows, in force units / time^(3/2); > 0.
         initial_value_sd: standard deviation of u at the initial time; >= 0.
-        initial_velocity_sd: standard deviation of u' at the initial time, in force units / time;
-            >= 0.
+        initial_velocity_sd: standard deviation of u' at the initial time, in force units / time; >= 0.
         mean: a number, or a function of time.
 
     Raises:
