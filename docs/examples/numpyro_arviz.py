@@ -20,8 +20,9 @@ def gene(times, y=None, order=1):
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.5, 0.5))
     model = lfm.LatentForceModel(
         dynamics=lambda x, u, t: u - decay * x,
-        forces={"production": lfm.Matern(scale=1.0, lengthscale=lengthscale, order=order)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
+        forces={"production": lfm.Matern(1.0, lengthscale, order=order)},
+        observation=lfm.GaussianObservation(lambda x, u, t: x,
+                                            jnp.array([0.01])),
         initial_state=lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
         initial_time=-1.0,
     )
@@ -33,14 +34,14 @@ times = jnp.linspace(0.0, 10.0, 21)
 
 # --8<-- [start:prior]
 prior = Predictive(gene, num_samples=200)(jax.random.key(0), times)
-y = prior["y"][0]                                     # (21, 1): prior["y"] has the shape (200, 21, 1)
+y = prior["y"][0]  # (21, 1), the first of 200 simulated data sets
 # --8<-- [end:prior]
 
 # --8<-- [start:mcmc]
 def sample(**model_kwargs):
     """Sample with NumPyro's NUTS and convert the draws to an ArviZ object."""
-    mcmc = MCMC(NUTS(gene), num_warmup=300, num_samples=300, num_chains=2, chain_method="vectorized",
-                progress_bar=False)
+    mcmc = MCMC(NUTS(gene), num_warmup=300, num_samples=300, num_chains=2,
+                chain_method="vectorized", progress_bar=False)
     mcmc.run(jax.random.key(1), times, y, **model_kwargs)
     return lfm.to_arviz(mcmc, gene, times, y, model_kwargs=model_kwargs)
 
@@ -50,7 +51,7 @@ print(az.summary(smooth, var_names=["decay", "lengthscale"]))
 # --8<-- [end:mcmc]
 
 # --8<-- [start:compare]
-print(az.loo(smooth))                                 # 21 leave-one-out conditionals, one for each row
+print(az.loo(smooth))  # from 21 leave-one-out conditionals, one a row
 print(az.compare({"rough": rough, "smooth": smooth}))
 # --8<-- [end:compare]
 
@@ -58,13 +59,14 @@ print(az.compare({"rough": rough, "smooth": smooth}))
 guide = AutoMultivariateNormal(gene)
 svi = SVI(gene, guide, numpyro.optim.Adam(0.02), Trace_ELBO())
 fitted = svi.run(jax.random.key(2), 1000, times, y, progress_bar=False)
-draws = guide.sample_posterior(jax.random.key(3), fitted.params, sample_shape=(2, 200))
-variational = lfm.to_arviz(draws, gene, times, y)     # any draws of the parameters: (chains, draws, ...)
+draws = guide.sample_posterior(jax.random.key(3), fitted.params,
+                               sample_shape=(2, 200))  # chains, draws
+variational = lfm.to_arviz(draws, gene, times, y)
 # --8<-- [end:svi]
 
 # --8<-- [start:bind]
-bound = lfm.bind(gene, times, y)                      # log_density(z), log_density_gradient(z), smooth(z), ...
+bound = lfm.bind(gene, times, y)
 z = bound.unconstrain({"decay": 1.0, "lengthscale": 1.5})
-print(bound.names, bound.log_density(z))
-print(bound.smooth(z).force("production").mean)       # the posterior mean of the force at these parameters
+print(bound.names, bound.log_density(z), bound.log_density_gradient(z))
+print(bound.smooth(z).force("production").mean)
 # --8<-- [end:bind]
