@@ -4,7 +4,7 @@
 2. Compute the log likelihood of a reference: exact for linear models, a Fokker-Planck grid for one state, else
    replicates of a particle filter.
 3. Smooth the importance weights (Pareto), and correct the moments of the parameters.
-4. `judge` turns the numbers into a verdict: trust, corrected or re-run.
+4. `judge` turns the numbers into a verdict: trust, corrected, re-run or inconclusive.
 
 Source: Vehtari et al. (2024), JMLR 25(72); Andrieu and Roberts (2009), Annals of Statistics 37(2).
 """

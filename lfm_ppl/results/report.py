@@ -117,7 +117,7 @@ class AccuracyReport:
 
     @property
     def verdict(self) -> Verdict:
-        """The word (trust, corrected, re-run), the reason, the next command, and all remedies by cost."""
+        """The word (trust, corrected, re-run, inconclusive), the reason, the next command, and all remedies by cost."""
         attrs = self.dataset.attrs
         word, reason, command = (str(attrs[name]) for name in ("verdict", "reason", "command"))
         return Verdict(word, reason, command, tuple(json.loads(attrs.get("remedies", "[]"))))

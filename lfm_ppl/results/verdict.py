@@ -1,7 +1,8 @@
-"""The verdict of an accuracy report: trust, corrected or re-run, with the reason and the remedies.
+"""The verdict of an accuracy report (trust, corrected, re-run or inconclusive), with the reason and the remedies.
 
 1. Steps that are too long come first: the verdict is re-run with the command.
-2. Unreliable weights: remedies by cost; more iterations if they bring the likelihood closer, else exact chains.
+2. Unreliable weights: inconclusive if more draws or particles may change this; else re-run, with remedies by cost (more
+   iterations if they bring the likelihood closer, exact chains).
 3. Reliable weights: corrected if a mean or an sd changes noticeably, else trust.
 """
 
@@ -88,7 +89,7 @@ class Verdict(NamedTuple):
     """Judgement of a posterior of the Gaussian filter.
 
     Attributes:
-        word: trust, corrected or re-run.
+        word: trust, corrected, re-run or inconclusive.
         reason: in words.
         command: the command to type next; empty for none.
         remedies: all commands that make the posterior right, the cheapest first, each with its cost.
@@ -103,7 +104,9 @@ class Verdict(NamedTuple):
 def judge(findings: Findings) -> Verdict:
     """Return the verdict on a Gaussian-filter posterior.
 
-    - "re-run" where the integration steps are too long, or the importance ratios too uneven to correct with;
+    - "re-run" where the posterior must be sampled again: the integration steps are too long, or the importance ratios
+      too uneven to correct with;
+    - "inconclusive" where the check needs more draws or particles to tell;
     - "corrected" where some mean or sd is off, and the importance weights can be relied on;
     - "trust" otherwise: every mean within 0.1 sd and every sd within 10% of the corrected one, or within two Monte
       Carlo standard errors.
@@ -162,7 +165,7 @@ def _verdict_from(findings: Findings) -> tuple[str, str, str]:
     if findings.exact:
         return "trust", "the model is linear with Gaussian noise, for which the filter is exact.", ""
     if not findings.k < findings.threshold:
-        return "re-run", *_unreliable(findings)
+        return _unreliable(findings)
     shifted = _changed(findings.table)
     if shifted:
         reason = (f"the Gaussian filter has moved {_listed(shifted)}; the importance weights can be relied on "
@@ -178,9 +181,10 @@ def _verdict_from(findings: Findings) -> tuple[str, str, str]:
     return "trust", reason, f"lfm-ppl check RESULT --draws {more} --overwrite" if more > findings.checked else ""
 
 
-def _unreliable(findings: Findings) -> tuple[str, str]:
+def _unreliable(findings: Findings) -> tuple[str, str, str]:
+    """Return the verdict on importance ratios that cannot be relied on."""
     if not math.isfinite(findings.k) and findings.checked < min(LEAST_DRAWS, findings.available):
-        return (f"{findings.checked} draws are too few for a Pareto k.",
+        return ("inconclusive", f"{findings.checked} draws are too few for a Pareto k.",
                 f"lfm-ppl check RESULT --draws {min(200, findings.available)} --overwrite")
     digits = 2 if f"{findings.k:.2f}" != f"{findings.threshold:.2f}" else 4
     start = (f"k = {findings.k:.{digits}f} is not below {findings.threshold:.{digits}f}, so that the importance "
@@ -188,14 +192,16 @@ def _unreliable(findings: Findings) -> tuple[str, str]:
     if findings.noise_share > 0.5:
         reason = (f"{start}; {findings.noise_share:.0%} of the variance of the log ratios is noise of the particle "
                   "filter, which makes k larger.")
-        return reason, f"lfm-ppl check RESULT --particles {4 * findings.particles} --overwrite"
+        return "inconclusive", reason, f"lfm-ppl check RESULT --particles {4 * findings.particles} --overwrite"
     # The threshold rises with the number of draws.
     draws_needed = math.ceil(10.0 ** (1.0 / (1.0 - findings.k))) if 0.0 < findings.k < LARGEST_K else math.inf
     if findings.checked < draws_needed <= findings.available:
         more = min(2 * int(draws_needed), findings.available)  # a margin, because k itself is an estimate
-        return f"{start} with {findings.checked} draws.", f"lfm-ppl check RESULT --draws {more} --overwrite"
-    return (f"{start}: the posterior of the Gaussian filter is too far from the exact one. One command samples the "
-            "exact one, with the likelihood of a particle filter.", CORRECT)
+        command = f"lfm-ppl check RESULT --draws {more} --overwrite"
+        return "inconclusive", f"{start} with {findings.checked} draws.", command
+    reason = (f"{start}: the posterior of the Gaussian filter is too far from the exact one. One command samples the "
+              "exact one, with the likelihood of a particle filter.")
+    return "re-run", reason, CORRECT
 
 
 def _changed(table: pd.DataFrame) -> list[str]:
