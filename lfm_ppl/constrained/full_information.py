@@ -18,6 +18,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.constrained.augmented import augmented_model, build_rows
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
@@ -91,9 +92,10 @@ class ConstrainedEstimate(eqx.Module):
         return self.force_mean[:, self.force_names.index(name)]
 
 
-def full_information(model: LatentForceModel, times: Any, y: Any, lower: Mapping[str, Any] | None = None,
-                     upper: Mapping[str, Any] | None = None,
-                     constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), grid: Any = None,
+def full_information(model: LatentForceModel, times: ArrayLike, y: ArrayLike,
+                     lower: Mapping[str, ArrayLike] | None = None, upper: Mapping[str, ArrayLike] | None = None,
+                     constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (),
+                     grid: ArrayLike | int | None = None,
                      steps: int = 10, tolerance: float = 1e-10, max_passes: int = 100) -> ConstrainedEstimate:
     r"""Find the most probable trajectory of state and forces given all observations, under constraints.
 

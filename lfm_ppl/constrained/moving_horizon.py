@@ -25,6 +25,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.constrained.augmented import Rows, augmented_model
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
@@ -161,7 +162,7 @@ class MovingHorizon(eqx.Module):
     settings: HorizonSettings
 
     def __init__(self, model: LatentForceModel, window: int, delay: int | None = None,
-                 lower: Mapping[str, Any] | None = None, upper: Mapping[str, Any] | None = None,
+                 lower: Mapping[str, ArrayLike] | None = None, upper: Mapping[str, ArrayLike] | None = None,
                  constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), steps: int = 10,
                  tolerance: float = 1e-10, max_passes: int = 100):
         if model.initial_time is None:
@@ -180,7 +181,7 @@ class MovingHorizon(eqx.Module):
                             jnp.full((window, len(ssm.model.output_names)), jnp.nan, float), jnp.asarray(0, int),
                             initial_time, *ssm.initial())
 
-    def update(self, state: HorizonState, t: Any, y: Any) -> tuple[HorizonState, HorizonEstimate]:
+    def update(self, state: HorizonState, t: ArrayLike, y: ArrayLike) -> tuple[HorizonState, HorizonEstimate]:
         """Process one observation.
 
         Args:
@@ -206,8 +207,8 @@ class MovingHorizon(eqx.Module):
         return _update(self.settings, state, jnp.asarray(t, float), jnp.asarray(y, float))
 
 
-def moving_horizon(model: LatentForceModel, times: Any, y: Any, window: int, delay: int | None = None,
-                   lower: Mapping[str, Any] | None = None, upper: Mapping[str, Any] | None = None,
+def moving_horizon(model: LatentForceModel, times: ArrayLike, y: ArrayLike, window: int, delay: int | None = None,
+                   lower: Mapping[str, ArrayLike] | None = None, upper: Mapping[str, ArrayLike] | None = None,
                    constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), steps: int = 10,
                    tolerance: float = 1e-10, max_passes: int = 100) -> ConstrainedEstimate:
     """Run a moving horizon estimator over a record.

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.stats import norm
+from numpy.typing import ArrayLike
 
 from lfm_ppl.constrained.augmented import build_rows, stacked_model
 from lfm_ppl.constrained.boxes import Boxes, build_boxes
@@ -133,9 +134,10 @@ def _sample_inputs(posterior: TruncatedPosterior, proposal: FilterTrace, key: ja
     return trajectories.reshape(-1, *trajectories.shape[2:])[:draws]
 
 
-def constrained_posterior(model: LatentForceModel, times: Any, y: Any, lower: Mapping[str, Any] | None = None,
-                          upper: Mapping[str, Any] | None = None,
-                          constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), grid: Any = None,
+def constrained_posterior(model: LatentForceModel, times: ArrayLike, y: ArrayLike,
+                          lower: Mapping[str, ArrayLike] | None = None, upper: Mapping[str, ArrayLike] | None = None,
+                          constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (),
+                          grid: ArrayLike | int | None = None,
                           rule: Rule | None = None, steps: int = 10, sweeps: int = 200) -> ConstrainedPosterior:
     r"""Approximate the posterior of state and forces under constraints by expectation propagation.
 

@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.arguments import as_rule, check_observations, warn_single_precision
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
@@ -66,7 +67,7 @@ class FilterResult(eqx.Module):
     state: FilterState
 
 
-def filter(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None, steps: int = 10,
+def filter(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule | None = None, steps: int = 10,
            max_step: float | None = None, start: FilterState | None = None,
            tolerance: float | None = None) -> FilterResult:
     """Run the continuous-discrete Gaussian filter.

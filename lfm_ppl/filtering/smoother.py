@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.arguments import as_rule, check_iterations, check_observations, warn_single_precision
 from lfm_ppl.filtering.backward import SmootherTrace, backward
@@ -155,8 +156,8 @@ def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
     return Trajectories(result.times, inputs[:, :, :size], forces)
 
 
-def smooth(model: LatentForceModel, times: Any, y: Any, rule: Rule | None = None, steps: int = 10,
-           max_step: float | None = None, at: Any = None, iterations: int = 0, damping: float = 0.7,
+def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule | None = None, steps: int = 10,
+           max_step: float | None = None, at: ArrayLike | None = None, iterations: int = 0, damping: float = 0.7,
            tolerance: float | None = None, sites: SiteSettings | str | None = None) -> SmootherResult:
     """Smooth: the state and the forces given all observations.
 

@@ -21,6 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.intervals import TimeGrid
@@ -80,8 +81,8 @@ class FokkerPlanckResult(eqx.Module):
     grid: Grid = eqx.field(static=True)
 
 
-def fokker_planck(model: LatentForceModel, times: Any, y: Any, *, at: Any = None, cells: int | None = None,
-                  bounds: tuple[float, float] | None = None, steps: int = 1,
+def fokker_planck(model: LatentForceModel, times: ArrayLike, y: ArrayLike, *, at: ArrayLike | None = None,
+                  cells: int | None = None, bounds: tuple[float, float] | None = None, steps: int = 1,
                   tolerance: float = 1e-3) -> FokkerPlanckResult:
     """Filter and smooth a one-dimensional state exactly, up to a grid's resolution.
 
@@ -141,8 +142,9 @@ def fokker_planck(model: LatentForceModel, times: Any, y: Any, *, at: Any = None
     return eqx.tree_at(lambda r: r.error, result, jnp.asarray(error))
 
 
-def choose_grid(models: LatentForceModel | Sequence[LatentForceModel], times: Any, y: Any, *, cells: int | None = None,
-                bounds: tuple[float, float] | None = None, steps: int = 1, tolerance: float = 1e-3) -> Grid:
+def choose_grid(models: LatentForceModel | Sequence[LatentForceModel], times: ArrayLike, y: Any, *,
+                cells: int | None = None, bounds: tuple[float, float] | None = None, steps: int = 1,
+                tolerance: float = 1e-3) -> Grid:
     """Choose one grid for one model, or for several models, such as draws of the parameters.
 
     The bounds are moved until every predicted and filtered density has less than 1e-10 of its mass next to them. The

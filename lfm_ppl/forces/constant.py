@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from lfm_ppl.forces.parameters import mean_parameter, positive_parameter
+from lfm_ppl.forces.parameters import Mean, mean_parameter, positive_parameter
 from lfm_ppl.forces.sde import Force
 
 
@@ -35,7 +35,7 @@ class Constant(Force):
 
     state_dim: ClassVar[int] = 1
 
-    def __init__(self, scale: Any, mean: Any = 0.0):
+    def __init__(self, scale: ArrayLike, mean: Mean = 0.0):
         self.scale = positive_parameter("scale", scale)
         self.mean = mean_parameter(mean)
 

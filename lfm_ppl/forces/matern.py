@@ -18,7 +18,7 @@ import functools
 from dataclasses import dataclass
 from fractions import Fraction
 from math import comb, factorial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import gauss_legendre, powers, step_tangent
+from lfm_ppl.forces.parameters import Mean
 from lfm_ppl.forces.stretched import Stretched, covariance_of_derivatives
 from lfm_ppl.utils.linalg import matmul
 
@@ -67,7 +68,7 @@ class Matern(Stretched):
 
     orders: ClassVar[range] = range(6)
 
-    def __init__(self, scale: Any, lengthscale: Any, order: int = 1, mean: Any = 0.0):
+    def __init__(self, scale: ArrayLike, lengthscale: ArrayLike, order: int = 1, mean: Mean = 0.0):
         super().__init__(scale, lengthscale, order, mean)
 
     @property

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from lfm_ppl.utils import checks
+
+Mean: TypeAlias = ArrayLike | Callable[[jax.Array], jax.Array]
+"""A constant mean, or a function of time."""
 
 
 def positive_parameter(name: str, value: Any) -> jax.Array:

@@ -96,7 +96,7 @@ class PeriodicMatern(PeriodicCovariance):
     order: int = eqx.field(static=True)
     has_fixed_period: bool = eqx.field(static=True)
 
-    def __init__(self, scale: Any, lengthscale: Any, period: Any, order: int = 1):
+    def __init__(self, scale: ArrayLike, lengthscale: ArrayLike, period: ArrayLike, order: int = 1):
         self.scale = positive_parameter("scale", scale)
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
         self.period, self.has_fixed_period = positive_parameter("period", period), _is_number(period)
@@ -131,7 +131,7 @@ class PeriodicSquaredExponential(PeriodicCovariance):
     period: jax.Array
     has_fixed_period: bool = eqx.field(static=True)
 
-    def __init__(self, scale: Any, lengthscale: Any, period: Any):
+    def __init__(self, scale: ArrayLike, lengthscale: ArrayLike, period: ArrayLike):
         self.scale = positive_parameter("scale", scale)
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
         self.period, self.has_fixed_period = positive_parameter("period", period), _is_number(period)
@@ -173,7 +173,8 @@ class ModeratedPeriodicMatern(PeriodicCovariance):
     order: int = eqx.field(static=True)
     has_fixed_period: bool = eqx.field(static=True)
 
-    def __init__(self, scale: Any, lengthscale: Any, period: Any, decay: Any = 1.0, order: int = 1):
+    def __init__(self, scale: ArrayLike, lengthscale: ArrayLike, period: ArrayLike, decay: ArrayLike = 1.0,
+                 order: int = 1):
         self.scale = positive_parameter("scale", scale)
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
         self.period, self.has_fixed_period = positive_parameter("period", period), _is_number(period)
@@ -227,7 +228,8 @@ class PeriodicKernel(PeriodicCovariance):
     label: str = eqx.field(static=True)
     has_fixed_period: bool = eqx.field(static=True)
 
-    def __init__(self, function: Callable[..., Any], period: Any, stationary: bool = False, start: Any = 0.0):
+    def __init__(self, function: Callable[..., Any], period: ArrayLike, stationary: bool = False,
+                 start: ArrayLike = 0.0):
         if not callable(function):
             raise TypeError(f"function must be callable as k(t, s), got {type(function).__name__}.")
         self.function = function if isinstance(function, eqx.Module) else jax.tree_util.Partial(function)

@@ -26,7 +26,7 @@ from jax.typing import ArrayLike
 
 from lfm_ppl.forces.basis import Basis, Eigenfunctions, Waves, cycle_points, spectrum, waves
 from lfm_ppl.forces.constant import Constant
-from lfm_ppl.forces.parameters import mean_parameter
+from lfm_ppl.forces.parameters import Mean, mean_parameter
 from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
 from lfm_ppl.forces.sde import ApproximationWarning, Force
 from lfm_ppl.utils import checks
@@ -105,7 +105,7 @@ class QuasiPeriodic(Force):
     explained_variance: float = eqx.field(static=True)
 
     def __init__(self, kernel: PeriodicCovariance, evolution: Force, functions: int | None = None, gamma: float = 0.01,
-                 mean: Any = 0.0, points: int = _POINTS, explained_variance: float = EXPLAINED_VARIANCE):
+                 mean: Mean = 0.0, points: int = _POINTS, explained_variance: float = EXPLAINED_VARIANCE):
         _check_kernel(kernel)
         if not isinstance(evolution, Force):
             raise TypeError("evolution must be CQM, SQM or WQM of lfm.forces, or a force of scale 1, got "
@@ -256,7 +256,7 @@ class Periodic(QuasiPeriodic):
     Source: Reece et al. (2014), section 5.
     """
 
-    def __init__(self, kernel: PeriodicCovariance, functions: int | None = None, gamma: float = 0.01, mean: Any = 0.0,
+    def __init__(self, kernel: PeriodicCovariance, functions: int | None = None, gamma: float = 0.01, mean: Mean = 0.0,
                  points: int = _POINTS, explained_variance: float = EXPLAINED_VARIANCE):
         super().__init__(kernel, Constant(1.0), functions, gamma, mean, points, explained_variance)
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from lfm_ppl.forces.parameters import mean_parameter, positive_parameter, standard_deviation_parameter
+from lfm_ppl.forces.parameters import Mean, mean_parameter, positive_parameter, standard_deviation_parameter
 from lfm_ppl.forces.sde import Force
 
 
@@ -39,7 +39,7 @@ class RandomWalk(Force):
 
     state_dim: ClassVar[int] = 1
 
-    def __init__(self, scale: Any, initial_sd: Any = 0.0, mean: Any = 0.0):
+    def __init__(self, scale: ArrayLike, initial_sd: ArrayLike = 0.0, mean: Mean = 0.0):
         self.scale = positive_parameter("scale", scale)
         self.initial_sd = standard_deviation_parameter("initial_sd", initial_sd)
         self.mean = mean_parameter(mean)

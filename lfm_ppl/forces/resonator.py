@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import gauss_legendre
-from lfm_ppl.forces.parameters import mean_parameter, positive_parameter, standard_deviation_parameter
+from lfm_ppl.forces.parameters import Mean, mean_parameter, positive_parameter, standard_deviation_parameter
 from lfm_ppl.forces.sde import Force
 
 _NODES, _WEIGHTS = gauss_legendre(16)
@@ -59,7 +59,8 @@ class Resonator(Force):
 
     state_dim: ClassVar[int] = 2
 
-    def __init__(self, period: Any, scale: Any, noise: Any = 0.0, damping: Any = 0.0, mean: Any = 0.0):
+    def __init__(self, period: ArrayLike, scale: ArrayLike, noise: ArrayLike = 0.0, damping: ArrayLike = 0.0,
+                 mean: Mean = 0.0):
         self.period = positive_parameter("period", period)
         self.scale = standard_deviation_parameter("scale", scale)
         self.noise = standard_deviation_parameter("noise", noise)

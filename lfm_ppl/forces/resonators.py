@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from lfm_ppl.forces.basis import Waves
 from lfm_ppl.forces.constant import Constant
-from lfm_ppl.forces.parameters import standard_deviation_parameter
+from lfm_ppl.forces.parameters import Mean, standard_deviation_parameter
 from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
 from lfm_ppl.forces.quasi_periodic import EXPLAINED_VARIANCE, stationary_basis, warn_of_lost_variance
 from lfm_ppl.forces.resonator import Resonator
@@ -17,8 +16,8 @@ from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import safe_sqrt
 
 
-def resonators(kernel: PeriodicCovariance, functions: int | None = None, gamma: float = 0.01, noise: Any = 0.0,
-               damping: Any = 0.0, mean: Any = 0.0, explained_variance: float = EXPLAINED_VARIANCE) -> Sum:
+def resonators(kernel: PeriodicCovariance, functions: int | None = None, gamma: float = 0.01, noise: ArrayLike = 0.0,
+               damping: ArrayLike = 0.0, mean: Mean = 0.0, explained_variance: float = EXPLAINED_VARIANCE) -> Sum:
     """Return the sum of a level and resonators that has a stationary periodic kernel as its prior.
 
     The leading eigenfunctions of such a kernel are a constant and pairs of cosine and sine, of frequencies j/D and
@@ -51,11 +50,11 @@ def resonators(kernel: PeriodicCovariance, functions: int | None = None, gamma: 
 
     Source: Reece et al. (2014), appendix B.1.1.
     """
-    noise = standard_deviation_parameter("noise", noise)
+    noise_sd = standard_deviation_parameter("noise", noise)
     basis: Waves = stationary_basis(kernel, functions, gamma)
     warn_of_lost_variance(kernel, basis, explained_variance)
     scales = safe_sqrt(basis.powers)
-    terms = [Resonator(kernel.period / (index + 1), scale, noise * scale, damping)
+    terms = [Resonator(kernel.period / (index + 1), scale, noise_sd * scale, damping)
              for index, scale in enumerate(scales)]
     level = checks.concrete(basis.level)
     # A kernel may have no level, but the level's force carries the mean. A tiny scale stands for zero.

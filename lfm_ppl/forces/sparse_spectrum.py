@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 
 from lfm_ppl.forces.basis import Waves, fourier_coefficients
 from lfm_ppl.forces.matern import Matern
-from lfm_ppl.forces.parameters import mean_parameter, positive_parameter
+from lfm_ppl.forces.parameters import Mean, mean_parameter, positive_parameter
 from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
@@ -51,7 +51,7 @@ class SparseSpectrum(Force):
     frequencies: jax.Array
     mean: Any
 
-    def __init__(self, scale: Any, frequencies: Any, mean: Any = 0.0):
+    def __init__(self, scale: ArrayLike, frequencies: ArrayLike, mean: Mean = 0.0):
         self.scale = positive_parameter("scale", scale)
         checks.finite("frequencies", frequencies)
         self.frequencies = jnp.asarray(frequencies, float)

@@ -9,8 +9,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
-from lfm_ppl.forces.parameters import mean_parameter, positive_parameter, static_order
+from lfm_ppl.forces.parameters import Mean, mean_parameter, positive_parameter, static_order
 from lfm_ppl.forces.sde import Force
 
 
@@ -51,7 +52,7 @@ class Stretched(Force):
 
     orders: ClassVar[Sequence[int]]
 
-    def __init__(self, scale: Any, lengthscale: Any, order: int, mean: Any = 0.0):
+    def __init__(self, scale: ArrayLike, lengthscale: ArrayLike, order: int, mean: Mean = 0.0):
         self.scale = positive_parameter("scale", scale)
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
         self.order = static_order(order, self.orders)

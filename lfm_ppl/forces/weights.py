@@ -45,7 +45,7 @@ class CQM(Matern):
     Source: Reece et al. (2014), equation 38.
     """
 
-    def __init__(self, lengthscale: Any):
+    def __init__(self, lengthscale: ArrayLike):
         super().__init__(1.0, lengthscale, order=0)
 
 
@@ -125,7 +125,7 @@ class SQM(_StepEvolution):
 
     lengthscale: jax.Array
 
-    def __init__(self, lengthscale: Any, change_points: Sequence[float]):
+    def __init__(self, lengthscale: ArrayLike, change_points: Sequence[float]):
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
         self.change_points = _increasing_times(change_points)
         self.mean = scalar_parameter("mean", 0.0)
@@ -166,7 +166,7 @@ class WQM(_StepEvolution):
 
     growth: jax.Array
 
-    def __init__(self, growth: Any, change_points: Sequence[float]):
+    def __init__(self, growth: ArrayLike, change_points: Sequence[float]):
         self.growth = standard_deviation_parameter("growth", growth)
         self.change_points = _increasing_times(change_points)
         self.mean = scalar_parameter("mean", 0.0)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from lfm_ppl.forces.parameters import mean_parameter, positive_parameter, standard_deviation_parameter
+from lfm_ppl.forces.parameters import Mean, mean_parameter, positive_parameter, standard_deviation_parameter
 from lfm_ppl.forces.sde import Force
 
 
@@ -50,10 +50,10 @@ class WienerVelocity(Force):
 
     def __init__(
         self,
-        scale: Any,
-        initial_value_sd: Any = 0.0,
-        initial_velocity_sd: Any = 0.0,
-        mean: Any = 0.0,
+        scale: ArrayLike,
+        initial_value_sd: ArrayLike = 0.0,
+        initial_velocity_sd: ArrayLike = 0.0,
+        mean: Mean = 0.0,
     ):
         self.scale = positive_parameter("scale", scale)
         self.initial_value_sd = standard_deviation_parameter("initial_value_sd", initial_value_sd)

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.arguments import check_observations
 from lfm_ppl.inference.bound_model import BoundModel
@@ -15,7 +16,7 @@ from lfm_ppl.inference.traced_model import traced_model
 from lfm_ppl.utils import checks
 
 
-def bind(model: Callable, times: Any, y: Any, **keywords: Any) -> BoundModel:
+def bind(model: Callable, times: ArrayLike, y: ArrayLike, **keywords: Any) -> BoundModel:
     """Bind a NumPyro model to its times and data: its log posterior as a plain function, for any sampler.
 
     Args:

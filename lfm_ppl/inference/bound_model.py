@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 from numpyro.infer import init_to_median
 
 from lfm_ppl.filtering.filter import FilterResult
@@ -57,8 +58,9 @@ class BoundModel:
         traced: the model without its data.
     """
 
-    def __init__(self, traced: TracedModel, y: Any) -> None:
-        self.traced, self.y = traced, y
+    def __init__(self, traced: TracedModel, y: ArrayLike) -> None:
+        self.traced = traced
+        self.y: Any = y
         self._trace: dict[str, Any] | None = None
 
     @property
@@ -113,7 +115,7 @@ class BoundModel:
         name = getattr(self.model, "__name__", type(self.model).__name__)
         return f"BoundModel({name}: {', '.join(self.names)})"
 
-    def with_data(self, y: Any) -> BoundModel:
+    def with_data(self, y: ArrayLike) -> BoundModel:
         """Return the same model bound to other data of the same shape; nothing is compiled again.
 
         Raises:
@@ -124,7 +126,7 @@ class BoundModel:
             traced = TracedModel(traced.model, (*traced.arguments[:-1], y), None, traced.keywords, y, traced.caller)
         return BoundModel(traced, y)
 
-    def data(self, y: Any = None) -> Any:
+    def data(self, y: ArrayLike | None = None) -> Any:
         """Return the data: ``y`` after checking it, or the bound data.
 
         Raises:
@@ -164,7 +166,7 @@ class BoundModel:
 
     # --- densities
 
-    def log_density(self, z: Any, y: Any = None) -> jax.Array:
+    def log_density(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
         """Return the log density of the unconstrained parameters, Jacobian included; -inf where a filter breaks down.
 
         Args:
@@ -175,7 +177,7 @@ class BoundModel:
         run = traced.memoized("log density", lambda: jax.jit(lambda z, y: -traced.potential(z, y)))
         return run(self._position(z), self._argument(y))
 
-    def log_density_gradient(self, z: Any, y: Any = None) -> tuple[jax.Array, jax.Array]:
+    def log_density_gradient(self, z: ArrayLike, y: ArrayLike | None = None) -> tuple[jax.Array, jax.Array]:
         """Return the log density and its gradient (d,); arguments as `log_density`."""
         return self.gradient(self.forward_mode)(self._position(z), self._argument(y))
 
@@ -184,7 +186,7 @@ class BoundModel:
         return self.compiled(("gradient", jacobian, forward_mode),
                              lambda: jax.jit(value_and_gradient(self._target(jacobian), forward_mode)))
 
-    def log_likelihood(self, z: Any, y: Any = None) -> jax.Array:
+    def log_likelihood(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
         """Return log p(y | T(z)), summed over the series of a panel; arguments as `log_density`."""
         def log_likelihood(z: jax.Array, y: Any) -> jax.Array:
             site = self._site_at(z, y)
@@ -193,7 +195,7 @@ class BoundModel:
         run = self.compiled("log likelihood", lambda: jax.jit(log_likelihood))
         return run(self._position(z), self._argument(y))
 
-    def log_prior(self, z: Any, y: Any = None) -> jax.Array:
+    def log_prior(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
         """Return the log prior density of the unconstrained parameters, Jacobian included."""
         traced = self.traced
         run = traced.memoized("log prior", lambda: jax.jit(
@@ -235,7 +237,8 @@ class BoundModel:
             return lambda z, y: -traced.potential(z, y)
         return lambda z, y: -traced.constrained_potential(z, y)
 
-    def log_density_with(self, handler: Callable[[Callable], Callable], z: Any, y: Any = None) -> jax.Array:
+    def log_density_with(self, handler: Callable[[Callable], Callable], z: ArrayLike,
+                         y: ArrayLike | None = None) -> jax.Array:
         """Return the log density with another likelihood instead of the filter's; not compiled.
 
         Args:
@@ -247,16 +250,16 @@ class BoundModel:
 
     # --- parameters
 
-    def unravel(self, z: Any) -> dict[str, jax.Array]:
+    def unravel(self, z: ArrayLike) -> dict[str, jax.Array]:
         """Return the unconstrained values of each site: the ``init_params`` of ``MCMC.run``."""
         return self.traced.unravel(jnp.asarray(z, float))
 
-    def constrain(self, z: Any, y: Any = None) -> dict[str, jax.Array]:
+    def constrain(self, z: ArrayLike, y: ArrayLike | None = None) -> dict[str, jax.Array]:
         """Return site name -> value of the latent and the deterministic sites at z (d,)."""
         run = self.traced.memoized("constrain", lambda: jax.jit(self.traced.constrain))
         return run(self._position(z), self._argument(y))
 
-    def constrain_draws(self, z: Any) -> dict[str, np.ndarray]:
+    def constrain_draws(self, z: ArrayLike) -> dict[str, np.ndarray]:
         """Return site name -> values (..., *shape) at draws z (..., d)."""
         traced = self.traced
         run = traced.memoized("constrain draws", lambda: jax.jit(jax.vmap(traced.constrain, in_axes=(0, None))))
@@ -326,7 +329,7 @@ class BoundModel:
 
     # --- the filter and the smoother
 
-    def likelihood(self, z: Any, y: Any = None) -> SeriesLikelihood | Panel:
+    def likelihood(self, z: ArrayLike | Mapping[str, Any], y: ArrayLike | None = None) -> SeriesLikelihood | Panel:
         """Return the likelihood at parameters, in compiled code too.
 
         Args:
@@ -345,7 +348,7 @@ class BoundModel:
             site = site._replace(distribution=site.distribution.with_times(traced.constant_times))
         return site
 
-    def filter(self, z: Any, y: Any = None) -> FilterResult:
+    def filter(self, z: ArrayLike | Mapping[str, Any], y: ArrayLike | None = None) -> FilterResult:
         """Return the result of the Gaussian filter at parameters z (d,), or site name -> value; see `lfm_ppl.filter`.
 
         Raises:
@@ -359,7 +362,8 @@ class BoundModel:
 
         return self.compiled("filter", lambda: eqx.filter_jit(run))(_as_arrays(z), self._argument(y))
 
-    def smooth(self, z: Any, at: Any = None, y: Any = None) -> SmootherResult:
+    def smooth(self, z: ArrayLike | Mapping[str, Any], at: ArrayLike | None = None,
+               y: ArrayLike | None = None) -> SmootherResult:
         """Return the result of the smoother at parameters z (d,), or site name -> value; see `lfm_ppl.smooth`.
 
         Args:

@@ -17,6 +17,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.arguments import check_iterations
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
@@ -118,12 +119,12 @@ class MarginalLikelihood(SeriesLikelihood):
         return ConstrainedLikelihood(model, times, rule, steps, lower=lower, upper=upper, constraints=constraints,
                                      grid=grid, draws=draws)
 
-    def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None = None, steps: int = 10,
+    def __init__(self, model: LatentForceModel, times: ArrayLike, rule: Rule | None = None, steps: int = 10,
                  max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
                  tolerance: float | None = None, sites: SiteSettings | str | None = None, *,
-                 lower: Mapping[str, Any] | None = None, upper: Mapping[str, Any] | None = None,
-                 constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), grid: Any = None,
-                 draws: int = 256, validate_args: bool | None = None):
+                 lower: Mapping[str, ArrayLike] | None = None, upper: Mapping[str, ArrayLike] | None = None,
+                 constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (),
+                 grid: ArrayLike | int | None = None, draws: int = 256, validate_args: bool | None = None):
         _check_model(model)
         check_iterations(iterations or 0, damping, tolerance)
         if tolerance is not None:

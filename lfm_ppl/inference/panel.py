@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
+from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
 from lfm_ppl.filtering.arguments import as_rule
@@ -36,7 +37,8 @@ class Panel(dist.Distribution):
     pytree_data_fields = ("parameters", "times")
     pytree_aux_fields = ("build", "settings")
 
-    def __init__(self, build: Callable[..., LatentForceModel], parameters: Any, times: Any, settings: dict[str, Any]):
+    def __init__(self, build: Callable[..., LatentForceModel], parameters: Any, times: ArrayLike,
+                 settings: dict[str, Any]):
         leaves = jax.tree_util.tree_leaves(parameters)
         if not leaves:
             raise ValueError("parameters must hold at least one array with a leading axis for the series.")
@@ -84,7 +86,7 @@ class Panel(dist.Distribution):
         times = jnp.asarray(self.times, float)[index] if self._has_series_times else self.times
         return self._likelihood(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[index], self.parameters), times)
 
-    def with_times(self, times: Any) -> Panel:
+    def with_times(self, times: ArrayLike) -> Panel:
         """Return the same distribution with concrete times instead of traced ones."""
         panel = copy.copy(self)
         panel.times = times
@@ -139,7 +141,7 @@ class Panel(dist.Distribution):
         return jnp.asarray(value, float)
 
 
-def panel(build: Callable[..., LatentForceModel], parameters: Any, times: Any, rule: Rule | None = None,
+def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayLike, rule: Rule | None = None,
           steps: int = 10, max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
           tolerance: float | None = None, sites: SiteSettings | str | None = None) -> Panel:
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.

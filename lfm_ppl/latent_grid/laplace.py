@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from numpy.typing import ArrayLike
 
 from lfm_ppl.latent_grid.latent_grid import LatentGrid
 from lfm_ppl.model.observation_noise import require_gaussian
@@ -84,7 +85,7 @@ class LaplaceIterate(NamedTuple):
     stopped: jax.Array
 
 
-def laplace(latent: LatentGrid, y: Any, method: str = "trust-region", *, iterations: int = 300,
+def laplace(latent: LatentGrid, y: ArrayLike, method: str = "trust-region", *, iterations: int = 300,
             tolerance: float = 1e-8) -> LaplaceResult:
     r"""Approximate the posterior of the forces by a Gaussian at its mode.
 

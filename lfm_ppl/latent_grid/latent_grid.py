@@ -22,6 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.transition import linear_part
@@ -125,7 +126,7 @@ class LatentGrid(eqx.Module):
     rule: str = eqx.field(static=True)
     first: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, model: LatentForceModel, times: Any, points: Any = 363, rule: str = "linear"):
+    def __init__(self, model: LatentForceModel, times: ArrayLike, points: ArrayLike = 363, rule: str = "linear"):
         if not isinstance(model, LatentForceModel):
             raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
         warn_single_precision()
@@ -262,7 +263,7 @@ class LatentGrid(eqx.Module):
         forces = jnp.asarray(self.interpolation) @ u.T if uses_forces else jnp.zeros((len(state), len(u)))
         return jnp.concatenate([state, forces], axis=1)
 
-    def checked(self, y: Any) -> jax.Array:
+    def checked(self, y: ArrayLike) -> jax.Array:
         """Check observations (T, D), and return them as an array."""
         return check_observations(y, len(self.times), self.ssm.output_dim, model=self.ssm.model)
 

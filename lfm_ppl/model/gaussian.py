@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from numpy.typing import ArrayLike
 
 from lfm_ppl.utils import checks
 
@@ -30,7 +29,7 @@ class Gaussian(eqx.Module):
     mean: jax.Array
     covariance: jax.Array
 
-    def __init__(self, mean: Any, covariance: Any):
+    def __init__(self, mean: ArrayLike, covariance: ArrayLike):
         checks.finite("initial_state.mean", mean)
         checks.covariance_matrix("initial_state.covariance", covariance)
         self.mean = jnp.atleast_1d(jnp.asarray(mean, float))

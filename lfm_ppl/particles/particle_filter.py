@@ -21,6 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, with_observations
@@ -96,7 +97,7 @@ class FilterStep(NamedTuple):
     ancestors: Any = None
 
 
-def particle_filter(key: jax.Array, model: LatentForceModel, times: Any, y: Any, *, particles: int = 10_000,
+def particle_filter(key: jax.Array, model: LatentForceModel, times: ArrayLike, y: ArrayLike, *, particles: int = 10_000,
                     steps: int = 20, max_step: float | None = None, resampling: str = "systematic",
                     threshold: float = 0.5, scheme: str = "auto", batch: int | None = None) -> ParticleFilterResult:
     """Run the bootstrap particle filter.
@@ -181,7 +182,7 @@ def log_likelihood(ssm: StateSpaceModel, grid: TimeGrid, y: jax.Array, key: jax.
     return jnp.where(jnp.isnan(total), -jnp.inf, total)
 
 
-def check_inputs(ssm: StateSpaceModel, times: Any, y: Any, steps: int, max_step: float | None,
+def check_inputs(ssm: StateSpaceModel, times: ArrayLike, y: ArrayLike, steps: int, max_step: float | None,
                  requested_times: Any = None, interval_per_step: bool = False) -> tuple[TimeGrid, jax.Array]:
     """Check times, observations and steps; return the time grid and the observations as an array."""
     grid = build_time_grid(ssm, times, steps, max_step, requested_times, interval_per_step=interval_per_step)

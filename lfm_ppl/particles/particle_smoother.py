@@ -14,12 +14,11 @@ Source: Godsill, Doucet and West (2004), JASA 99(465); Kitagawa (1996), J. Compu
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, as_arrays
 from lfm_ppl.filtering.predict import exact_offset
@@ -115,9 +114,10 @@ class ParticleSmootherResult(eqx.Module):
         return SampledTrajectories(draws, draws.mean(axis=0), draws.std(axis=0, ddof=1))
 
 
-def particle_smoother(key: jax.Array, model: LatentForceModel, times: Any, y: Any, *, particles: int = 2_000,
-                      draws: int = 200, at: Any = None, method: str = "auto", steps: int = 20,
-                      max_step: float | None = None, resampling: str = "systematic", threshold: float = 0.5,
+def particle_smoother(key: jax.Array, model: LatentForceModel, times: ArrayLike, y: ArrayLike, *,
+                      particles: int = 2_000, draws: int = 200, at: ArrayLike | None = None,
+                      method: str = "auto", steps: int = 20, max_step: float | None = None,
+                      resampling: str = "systematic", threshold: float = 0.5,
                       scheme: str = "auto") -> ParticleSmootherResult:
     """Draw trajectories of the joint state given all observations.
 

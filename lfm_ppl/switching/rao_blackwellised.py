@@ -28,6 +28,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.filter import FilterState
@@ -99,9 +100,9 @@ class _Particles(NamedTuple):
     log_weights: jax.Array
 
 
-def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: Any, *, y: Any = None,
-                      start: FilterState | None = None, initial: Any = 0, decisions: Any = None,
-                      particles: int = 1000, steps: int = 10, max_step: float | None = None,
+def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: ArrayLike, *,
+                      y: ArrayLike | None = None, start: FilterState | None = None, initial: Any = 0,
+                      decisions: Any = None, particles: int = 1000, steps: int = 10, max_step: float | None = None,
                       resampling: str = "systematic", threshold: float = 0.5) -> RaoBlackwellisedResult:
     """Predict, or filter, a linear latent force model with a discrete input that follows a known rule.
 

@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.intervals import Intervals, as_arrays
@@ -44,7 +45,7 @@ class SwitchedSimulation(eqx.Module):
     y: jax.Array
 
 
-def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: Any, *, paths: int = 1,
+def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: ArrayLike, *, paths: int = 1,
                       start: FilterState | None = None, initial: Any = 0, decisions: Any = None, steps: int = 10,
                       max_step: float | None = None, scheme: str = "auto") -> SwitchedSimulation:
     """Draw paths of a latent force model with a discrete input that follows a known rule.

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.io.data import as_data
@@ -26,6 +27,7 @@ from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, observed_variable
 from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.types import Times
 from lfm_ppl.workflows.data_binding import bind_dates
 from lfm_ppl.workflows.fit import fit
 from lfm_ppl.workflows.fit_results import ConvergenceWarning
@@ -76,7 +78,7 @@ class Backtest:
         return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def backtest(numpyro_model: Callable, times: Any, y: Any = None, *, horizon: int, every: int = 1,
+def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, *, horizon: int, every: int = 1,
              first: int | None = None, season: int | None = None, sampler: str = "map", draws: int = 400,
              level: float = 0.95, seed: int = 0, progress: bool = False, **options: Any) -> Backtest:
     """Fit to the data up to an origin, predict what follows, move the origin on, and score it all.

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.inference import sampling
@@ -41,6 +42,7 @@ from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.layout import Labels, checked_truth
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import waiting
+from lfm_ppl.utils.types import Result, Times
 from lfm_ppl.workflows.data_binding import bind_dates, check_requested_times
 from lfm_ppl.workflows.fit_options import (
     FitOptions,
@@ -71,8 +73,8 @@ _START_SEARCH = "start: compiling and searching for starting points"
 
 def fit(
     numpyro_model: Callable,
-    times: Any,
-    y: Any = None,
+    times: Times,
+    y: ArrayLike | None = None,
     *,
     sampler: str = "nuts",
     chains: int = 4,
@@ -80,15 +82,15 @@ def fit(
     samples: int | None = None,
     thin: int | None = None,
     seed: int = 0,
-    at: Any = None,
+    at: Times | None = None,
     trajectory_draws: int = 400,
     model_kwargs: Mapping[str, Any] | None = None,
-    fixed: Mapping[str, Any] | None = None,
+    fixed: Mapping[str, ArrayLike] | None = None,
     init: Any = None,
     sampler_options: Mapping[str, Any] | None = None,
     chain_method: str | None = None,
     progress: bool = True,
-    truth: Mapping[str, Any] | None = None,
+    truth: Mapping[str, ArrayLike] | None = None,
     name: str | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
@@ -96,7 +98,7 @@ def fit(
     attributes: Mapping[str, Any] | None = None,
     dims: Mapping[str, Sequence[str]] | None = None,
     coords: Mapping[str, Sequence[Any]] | None = None,
-) -> Any:
+) -> Result:
     """Fit a latent force model: sample its parameters, then its forces given them.
 
     Args:

@@ -18,11 +18,12 @@ from lfm_ppl.results import inputs as known_inputs
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import Console
+from lfm_ppl.utils.types import Result, Times
 
 
-def forecast(result: Any, numpyro_model: Callable, times: Any, *, inputs: Mapping[str, Any] | None = None,
+def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: Mapping[str, Any] | None = None,
              model_kwargs: Mapping[str, Any] | None = None, draws: int = 400, seed: int = 0,
-             progress: bool = True) -> Any:
+             progress: bool = True) -> Result:
     """Predict new observations, with their noise, between the data and after them.
 
         p(y* | y) = int p(y* | s*, theta) p(s* | s_T, theta) p(s_T | y, theta) p(theta | y) ds* ds_T dtheta

@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
@@ -21,6 +22,7 @@ from lfm_ppl.inference.posterior import scores
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.layout import Labels, TrajectoryDraws, checked_truth, lay_out
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.types import Result
 from lfm_ppl.workflows.data_binding import check_requested_times
 from lfm_ppl.workflows.fit_options import model_docstring, versions
 from lfm_ppl.workflows.fit_results import best_effort, draw_paths, note_warnings, warn_of_convergence
@@ -30,10 +32,10 @@ _STATISTICS = {"diverging": "diverging", "accept_prob": "acceptance_rate", "num_
 """Field of a kernel's state -> its name in ArviZ."""
 
 
-def to_arviz(mcmc: Any, numpyro_model: Callable, times: Any, y: Any, *, at: Any = None, trajectory_draws: int = 400,
-             seed: int = 0, model_kwargs: Mapping[str, Any] | None = None,
+def to_arviz(mcmc: Any, numpyro_model: Callable, times: ArrayLike, y: ArrayLike, *, at: ArrayLike | None = None,
+             trajectory_draws: int = 400, seed: int = 0, model_kwargs: Mapping[str, Any] | None = None,
              dims: Mapping[str, Sequence[str]] | None = None, coords: Mapping[str, Sequence[Any]] | None = None,
-             truth: Mapping[str, Any] | None = None, name: str | None = None) -> Any:
+             truth: Mapping[str, ArrayLike] | None = None, name: str | None = None) -> Result:
     """Turn the draws of a plain NumPyro run into a result, with everything that `lfm_ppl.fit` stores.
 
     ArviZ's own converter sees a likelihood with a single observation, the whole sequence, so that ``az.loo`` of it says

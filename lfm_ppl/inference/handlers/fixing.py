@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
+from numpy.typing import ArrayLike
 
 from lfm_ppl.inference.handlers.likelihood_handler import Handler
 from lfm_ppl.inference.handlers.pinned import Pinned, elementwise
@@ -54,7 +55,7 @@ class fix(Handler):  # noqa: N801 (an effect handler, named as NumPyro names its
     def __init__(
         self,
         fn: Callable[..., Any] | None = None,
-        fixed: Mapping[str, Any] | None = None,
+        fixed: Mapping[str, ArrayLike] | None = None,
         labels: Sequence[str] = (),
     ) -> None:
         self.whole, self.elements = _split(fixed or {})

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
@@ -78,7 +79,7 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
 
     supports_constraints = False
 
-    def __init__(self, fn: Callable[..., Any] | None = None, points: Any = 363, rule: str = "linear") -> None:
+    def __init__(self, fn: Callable[..., Any] | None = None, points: ArrayLike = 363, rule: str = "linear") -> None:
         checks.one_of("rule", rule, RULES)
         self.points, self.rule = points, rule
         super().__init__(fn)

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from numpy.typing import ArrayLike
 from numpyro.infer import init_to_median
 from numpyro.infer.util import ParamInfo
 from numpyro.util import is_prng_key
@@ -133,7 +134,7 @@ class ParticleMarginalRAM(RAM):
         self,
         model: Callable,
         particles: int | None = None,
-        tune_at: Any = None,
+        tune_at: ArrayLike | None = None,
         delayed: bool = False,
         particle_steps: int | None = None,
         resampling: str = "systematic",
@@ -141,7 +142,7 @@ class ParticleMarginalRAM(RAM):
         scheme: str = "auto",
         target_accept_prob: float | None = None,
         initial_scale: float | None = None,
-        initial_covariance: Any = None,
+        initial_covariance: ArrayLike | None = None,
         adapt: str = "warmup",
         exponent: float = 2 / 3,
         init_strategy: Callable = init_to_median,
@@ -187,7 +188,7 @@ class ParticleMarginalRAM(RAM):
         assert self.estimate is not None and self.tuned is not None, "init must be called first."
         return self.estimate.settings._replace(particles=self.tuned.particles)
 
-    def prepare(self, bound: BoundModel, start: Any, tuned: Tuned | None = None) -> None:
+    def prepare(self, bound: BoundModel, start: ArrayLike | None, tuned: Tuned | None = None) -> None:
         """Check the filter and choose the number of particles, outside of compiled code, since shapes depend on it.
 
         Args:

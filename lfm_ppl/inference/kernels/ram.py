@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 from numpyro.infer import init_to_median
 from numpyro.infer.util import ParamInfo, initialize_model
 from numpyro.util import identity, is_prng_key
@@ -86,7 +87,7 @@ class RAM(Kernel):
         potential_fn: Callable[[Any], jax.Array] | None = None,
         target_accept_prob: float | None = None,
         initial_scale: float | None = None,
-        initial_covariance: Any = None,
+        initial_covariance: ArrayLike | None = None,
         adapt: str = "warmup",
         exponent: float = 2 / 3,
         init_strategy: Callable = init_to_median,
