@@ -78,67 +78,53 @@ class Data:
 
     def __post_init__(self) -> None:
         """Convert to arrays and check that the shapes fit together."""
-        if calendar_time.holds_dates(self.times):
-            self._read_dates()
-        checks.refuse_durations("times", self.times)
-        object.__setattr__(self, "times", np.asarray(checks.unmask(self.times), dtype=float))
-        object.__setattr__(self, "y", np.asarray(checks.unmask(self.y), dtype=float))
-        object.__setattr__(self, "outputs", tuple(self.outputs))
-        object.__setattr__(self, "inputs", {name: self._table_of(name, table) for name, table in self.inputs.items()})
-        expected = (len(self.times), len(self.outputs))
-        if self.times.ndim != 1 or self.y.shape != expected:
-            raise ValueError(
-                f"y must have shape (times, outputs) = {expected}, got {self.y.shape} for times "
-                f"of shape {self.times.shape} and outputs {self.outputs}."
-            )
-        checks.finite("times", self.times)
-        if np.any(np.diff(self.times) < 0):
-            index = int(np.argmax(np.diff(self.times) < 0)) + 1
-            raise ValueError(
-                f"times must not go back, got {self.times[index]:g} after "
-                f"{self.times[index - 1]:g} at index {index}. Sort the observations by time."
-            )
-
-    def _read_dates(self) -> None:
-        """Convert times that are dates, and note their origin and unit."""
-        unit = self.units.get("time")
-        if unit is not None:
-            checks.one_of('units["time"]', unit, calendar_time.SECONDS)
-        times, origin, unit = calendar_time.numbers_of("times", self.times, unit)
-        if self.origin is not None:
-            times, origin = calendar_time.positions("times", self.times, self.origin, unit), self.origin
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "origin", origin)
-        object.__setattr__(self, "units", {**self.units, "time": unit})
-
-    def _table_of(self, name: str, value: Any) -> InputTable:
-        """Return a known input as it is kept.
-
-        Raises:
-            TypeError: neither a tuple of times and values nor an `lfm.Input`.
-        """
-        if all(hasattr(value, part) for part in InputTable._fields):  # an Input
-            value = tuple(getattr(value, part) for part in InputTable._fields)
-        if not (isinstance(value, tuple) and 2 <= len(value) <= 3):
-            raise TypeError(f"the known input {name!r} must be (times, values), (times, values, interpolation) or an "
-                            f"lfm.Input, got {type(value).__name__}.")
-        times, values, *way = value
-        label = f"times of the known input {name!r}"
-        checks.refuse_durations(label, times)
-        times = calendar_time.positions(label, times, self.origin, self.units.get("time", ""))
-        times, values = (np.asarray(checks.unmask(part), float) for part in (times, values))
-        interpolation = way[0] if way else "previous"
-        if times.shape == values.shape and times.ndim == 1 and np.isnan(values).any():
-            if interpolation != "zero" and np.isnan(values).all():
-                raise ValueError(f"every value of the known input {name!r} is missing; expected at least one number.")
-            values = fill_blanks(f"the known input {name!r}", f"{name!r}: (times, values, 'zero')", times, values,
-                                  interpolation)
-            times, values = times[~np.isnan(values)], values[~np.isnan(values)]
-        return InputTable(times, values, stored_interpolation(interpolation))
+        times, origin, units = self.times, self.origin, dict(self.units)
+        checks.refuse_durations("times", times)
+        if unit := units.get("time"):
+            units["time"] = calendar_time.UNITS.get(unit, unit)
+        if calendar_time.holds_dates(times):
+            if unit:
+                checks.one_of('units["time"]', unit, calendar_time.SECONDS)
+            numbers, midnight, units["time"] = calendar_time.numbers_of("times", times, unit)
+            times = calendar_time.positions("times", times, origin, units["time"]) if origin else numbers
+            origin = origin or midnight
+        times, y = (np.asarray(checks.unmask(values), float) for values in (times, self.y))
+        inputs = {name: _input_table(name, value, origin, units.get("time", "")) for name, value in self.inputs.items()}
+        for name, value in {"times": times, "y": y, "outputs": tuple(self.outputs), "units": units, "inputs": inputs,
+                            "origin": origin}.items():
+            object.__setattr__(self, name, value)
+        if times.ndim != 1 or y.shape != (len(times), len(self.outputs)):
+            raise ValueError(f"y must have shape (times, outputs) = ({len(times)}, {len(self.outputs)}), got {y.shape} "
+                             f"for times of shape {times.shape} and outputs {self.outputs}.")
+        checks.finite("times", times)
+        for index in np.flatnonzero(np.diff(times) < 0)[:1] + 1:
+            raise ValueError(f"times must not go back, got {times[index]:g} after {times[index - 1]:g} at index "
+                             f"{index}. Sort the observations by time.")
 
     def known_inputs(self) -> dict[str, Input]:
         """Return the known inputs as functions of time, for the ``inputs`` argument of a model."""
         return as_inputs(self.inputs)
+
+
+def _input_table(name: str, value: Any, origin: str | None, unit: str) -> InputTable:
+    """Return a known input, (times, values), (times, values, interpolation) or an `lfm.Input`, as a table."""
+    if all(hasattr(value, part) for part in InputTable._fields):  # an Input
+        value = tuple(getattr(value, part) for part in InputTable._fields)
+    if not (isinstance(value, tuple) and 2 <= len(value) <= 3):
+        raise TypeError(f"the known input {name!r} must be (times, values), (times, values, interpolation) or an "
+                        f"lfm.Input, got {type(value).__name__}.")
+    times, values, interpolation = (*value, "previous")[:3]
+    label = f"times of the known input {name!r}"
+    checks.refuse_durations(label, times)
+    times = calendar_time.positions(label, times, origin, unit)
+    times, values = (np.asarray(checks.unmask(part), float) for part in (times, values))
+    if times.shape == values.shape and times.ndim == 1 and np.isnan(values).any():
+        if interpolation != "zero" and np.isnan(values).all():
+            raise ValueError(f"every value of the known input {name!r} is missing; expected at least one number.")
+        remedy = f"{name!r}: (times, values, 'zero')"
+        values = fill_blanks(f"the known input {name!r}", remedy, times, values, interpolation)
+        times, values = times[~np.isnan(values)], values[~np.isnan(values)]
+    return InputTable(times, values, "previous" if interpolation == "zero" else interpolation)
 
 
 def as_inputs(tables: Mapping[str, InputTable]) -> dict[str, Input]:
@@ -175,48 +161,27 @@ def at_origin(data: Data, origin: str, unit: str) -> Data:
     Raises:
         ValueError: only one of the origins has an offset from UTC.
     """
-    assert data.origin is not None
     ratio = calendar_time.SECONDS[data.units["time"]] / calendar_time.SECONDS[unit]
-    shift = calendar_time.position(data.origin, origin, unit)
+    shift = float(calendar_time.positions("origin", data.origin, origin, unit))
     truth = data.truth
     if truth is not None and truth.get("times") is not None:
         truth = {**truth, "times": np.asarray(truth["times"], float) * ratio + shift}
-    return replace(data, times=data.times * ratio + shift, truth=truth, origin=origin,
-                   units={**data.units, "time": unit},
-                   inputs={name: table._replace(times=table.times * ratio + shift)
-                           for name, table in data.inputs.items()})
+    inputs = {name: table._replace(times=table.times * ratio + shift) for name, table in data.inputs.items()}
+    return replace(data, times=data.times * ratio + shift, truth=truth, origin=origin, inputs=inputs,
+                   units={**data.units, "time": unit})
 
 
-def number_array(name: str, value: Any) -> np.ndarray:
-    """Return an array of numbers; ValueError names the argument."""
-    try:
-        return np.asarray(value, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be numbers, in rows of one length.") from None
+def fill_blanks(label: str, remedy: str, times: np.ndarray, values: np.ndarray, interpolation: str) -> np.ndarray:
+    """Return the values (K,) of a known input, with zeros for NaN where the interpolation is "zero".
 
-
-def zero_option(name: str) -> str:
-    """Return how to say that empty cells of a column are zero."""
-    return f"--inputs {name}:zero (inputs={{{name!r}: 'zero'}})"
-
-
-def stored_interpolation(interpolation: str) -> str:
-    """Return how a known input is interpolated once its empty cells have been read."""
-    return "previous" if interpolation == "zero" else interpolation
-
-
-def fill_blanks(label: str, option: str, times: np.ndarray, values: np.ndarray, interpolation: str) -> np.ndarray:
-    """Return the values (K,) of a known input, with zeros for blank ones where that is how they are read.
+    Otherwise warn of NaN, over which the input is interpolated. NaN beside a number of the same time counts as filled.
 
     Args:
-        label: of the input, for messages.
-        option: how to say that blank values are zero.
+        label: name of the input in the warning.
+        remedy: how to read blank values as zero.
         times: (K,).
-        values: (K,), NaN where blank. A blank value at the time of another row that has one says nothing.
+        values: (K,).
         interpolation: one of `INTERPOLATIONS`.
-
-    Warns:
-        UserWarning: of blank values over which the input is interpolated.
     """
     is_blank = np.isnan(values) & ~np.isin(times, times[np.isfinite(values)])
     if interpolation == "zero":
@@ -224,5 +189,5 @@ def fill_blanks(label: str, option: str, times: np.ndarray, values: np.ndarray, 
     if is_blank.any():
         reading = "a line joins the values beside them" if interpolation == "linear" else "the last value holds there"
         checks.warn(f"{label}: {int(is_blank.sum())} of {len(values)} values of the known input are blank, and "
-                    f"{reading}. If blank means zero, as for a dose, say so: {option}.")
+                    f"{reading}. If blank means zero, as for a dose, say so: {remedy}.")
     return values

@@ -1,10 +1,6 @@
 """Find, load and check model files: shipped ones by name, others by path.
 
-1. Execute the file as a module of its own.
-2. Check the functions and constants that it defines, with the reason of a failure in one line.
-3. Call its functions with the arguments that they take.
-
-A model file is an ordinary Python file. It must define
+A model file is an ordinary Python file, executed as a module of its own. It must define
 
     model(times, y=None, **options)     the NumPyro model, with one site ``y``
 
@@ -20,9 +16,8 @@ and may define, each with a sensible default,
     PARAMETERS   name of a sample site -> help, with its unit
     TARGET_ACCEPT    target acceptance of NUTS, if the default makes its steps too long
 
-A ``model`` with an argument ``outputs`` or ``units`` gets the names of the outputs and the
-units of the data, for ``LatentForceModel(..., output_names=outputs, units=units)``. One that has an argument ``inputs``
-gets the known inputs of the data: name -> `lfm.Input`, a function of time.
+A ``model`` with an argument ``outputs``, ``units`` or ``inputs`` gets the names of the outputs, the units or the known
+inputs (name -> `lfm.Input`) of the data.
 """
 
 from __future__ import annotations
@@ -36,13 +31,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType, ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from lfm_ppl.io.data_set import INTERPOLATIONS, Data
 from lfm_ppl.utils import checks
 
-_MODULE = "_lfm_ppl_model_"
-"""Begins the names of the modules that model files become."""
+_MODULE = "_lfm_ppl_model_"  # prefix of the names of the modules of model files
 
 
 @dataclass(frozen=True)
@@ -50,87 +44,61 @@ class ModelFile:
     """A model file that has been loaded and checked.
 
     Attributes:
-        name: ``ginzburg-landau`` for ``ginzburg_landau.py``.
-        path: where it is.
-        summary: the first line of its docstring.
-        description: the whole docstring.
+        path: the file.
+        definitions: functions and constants of the file, and other names in it.
         model: the NumPyro model function.
         outputs: names of the outputs, or None for any number of them.
+        inputs: known inputs that the model takes: name -> interpolation.
         units: name -> unit.
         options: option -> (default, tuple of choices or a type, help).
         parameters: name of a sample site -> help.
-        inputs: known inputs that the model takes: name -> interpolation.
-        target_accept: acceptance that NUTS aims at; None for its own.
+        target_accept: target acceptance of NUTS; None for its default.
     """
 
-    name: str
     path: Path
-    summary: str
-    description: str
+    definitions: Mapping[str, Any] = field(repr=False, compare=False)
     model: Callable[..., None]
     outputs: tuple[str, ...] | None
+    inputs: Mapping[str, str]
     units: Mapping[str, str]
     options: Mapping[str, tuple[Any, Any, str]]
     parameters: Mapping[str, str]
-    inputs: Mapping[str, str] = field(default_factory=dict)
-    target_accept: float | None = None
-    _simulate: Callable[..., Data] | None = None
-    _prepare: Callable[[Data], Data] | None = None
-    _anchors: Callable[[Data], Mapping[str, float]] | None = None
-    _names: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
+    target_accept: float | None
 
     @property
-    def definitions(self) -> Mapping[str, Any]:
-        """Functions and constants of the file, and whatever else it names, by name.
+    def name(self) -> str:
+        """``ginzburg-landau`` for ``ginzburg_landau.py``."""
+        return _name(self.path)
 
-        Example:
-            >>> load("epidemic").definitions["FORCE"]
-            'log transmission'
-        """
-        return MappingProxyType(self._names)
+    @property
+    def description(self) -> str:
+        """The docstring of the file."""
+        return (self.definitions["__doc__"] or "").strip()
+
+    @property
+    def summary(self) -> str:
+        """The first line of the docstring."""
+        return self.description.partition("\n")[0]
 
     @property
     def can_simulate(self) -> bool:
         """Whether the file has data of its own."""
-        return self._simulate is not None
+        return "simulate" in self.definitions
 
     def simulate(self, seed: int | None = None, **options: Any) -> Data:
-        """Return simulated data with its truth; the model's default data where seed is None.
-
-        Raises:
-            ValueError: if the file defines no ``simulate``.
-        """
-        if self._simulate is None:
-            raise ValueError(
-                f"{self.path} defines no simulate(seed=0, **options), so it has no data of its "
-                "own. Give a data file with --data FILE, or add the function."
-            )
-        seeded = {} if seed is None else {"seed": seed}
-        _check_call(self.path, "simulate", self._simulate, "seed and the names in OPTIONS", **seeded, **options)
-        data = self._simulate(**seeded, **options)
-        if not isinstance(data, Data):
-            raise TypeError(f"simulate in {self.path} must return lfm.Data, got {_type(data)}.")
-        return self._completed("simulate", data)
+        """Return simulated data with its truth; the model's default data where seed is None."""
+        if not self.can_simulate:
+            raise ValueError(f"{self.path} defines no simulate(seed=0, **options), so it has no data of its own. Give "
+                             "a data file with --data FILE, or add the function.")
+        return self._data("simulate", **({} if seed is None else {"seed": seed}), **options)
 
     def prepare(self, data: Data) -> Data:
         """Return a user's data in the form that the model takes; ``note`` says what was done."""
-        if self._prepare is not None:
-            _check_call(self.path, "prepare", self._prepare, "the data", data)
-            data = self._prepare(data)
-            if not isinstance(data, Data):
-                raise TypeError(f"prepare in {self.path} must return lfm.Data, got {_type(data)}.")
-        return self._completed("prepare", data)
+        return self._data("prepare", data)
 
     def anchors(self, data: Data) -> dict[str, float]:
         """Return the parameters that are fixed for this data unless the user frees them."""
-        if self._anchors is None:
-            return {}
-        _check_call(self.path, "anchors", self._anchors, "the data", data)
-        anchors = self._anchors(data)
-        if not isinstance(anchors, Mapping):
-            raise TypeError(f"anchors in {self.path} must return a mapping of names of parameters to values, got "
-                            f"{_type(anchors)}.")
-        return dict(anchors)
+        return dict(self._call("anchors", Mapping, data))
 
     def keywords(self, data: Data, options: Mapping[str, Any]) -> dict[str, Any]:
         """Return the keyword arguments of ``model`` for this data and these options."""
@@ -140,200 +108,155 @@ class ModelFile:
         if data.inputs and "inputs" not in parameters:
             raise ValueError(f"{self.path}: the data have the known input {next(iter(data.inputs))!r}, and model(...) "
                              "has no argument `inputs` to take it by.")
-        if lacking := [name for name in self.inputs if name not in data.inputs]:
-            raise ValueError(f"{self.name} needs the known input {lacking[0]!r}, which the data do not have.")
+        for name in self.inputs:
+            if name not in data.inputs:
+                raise ValueError(f"{self.name} needs the known input {name!r}, which the data do not have.")
         return keywords | {name: value for name, value in from_data.items() if name in parameters}
 
     def option(self, name: str, text: str) -> Any:
-        """Return the value of option ``name`` that ``text`` stands for.
-
-        Raises:
-            ValueError: for an unknown option, or a value that it does not take.
-        """
-        if name not in self.options:
-            raise ValueError(checks.unknown(f"option of {self.name}", name, self.options))
+        """Return the value of an option that a text stands for; ValueError where it does not take it."""
+        checks.one_of(f"option of {self.name}", name, self.options)
         _, accepted, _ = self.options[name]
+        choices = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
         if isinstance(accepted, tuple):
             choices = {str(choice): choice for choice in accepted}
-            if text not in choices:
-                raise ValueError(checks.unknown(f"value of option {name}", text, choices))
+            checks.one_of(f"value of option {name}", text, choices)
             return choices[text]
         try:
-            return _convert(accepted, text)
-        except ValueError:
-            raise ValueError(
-                f"option {name} of {self.name} takes a value of type {accepted.__name__}, "
-                f"got {text!r}."
-            ) from None
+            return choices[text.lower()] if accepted is bool else accepted(text)
+        except (ValueError, KeyError):
+            raise ValueError(f"option {name} of {self.name} takes a value of type {accepted.__name__}, got "
+                             f"{text!r}.") from None
 
-    def _completed(self, function: str, data: Data) -> Data:
-        """Return data with the units of the model."""
+    def _data(self, name: str, *arguments: Any, **keywords: Any) -> Data:
+        """Return the data of ``simulate`` or ``prepare``, with the units of the model."""
+        data = self._call(name, Data, *arguments, **keywords)
         if self.outputs is not None and data.outputs != self.outputs:
-            raise ValueError(f"{function} in {self.path} returns data of {', '.join(data.outputs)}, but the file has "
+            raise ValueError(f"{name} in {self.path} returns data of {', '.join(data.outputs)}, but the file has "
                              f"OUTPUTS = {self.outputs}; make them the same.")
         return replace(data, units={**self.units, **data.units})
+
+    def _call(self, name: str, result_type: type, *arguments: Any, **keywords: Any) -> Any:
+        """Return the result of a function of the file; without it, the data of ``prepare`` or no anchors."""
+        if name not in self.definitions:
+            return arguments[0] if name == "prepare" else {}
+        _check_signature(self.path, self.definitions, name, *arguments, **keywords)
+        result = self.definitions[name](*arguments, **keywords)
+        if not isinstance(result, result_type):
+            expected = "lfm.Data" if result_type is Data else "a mapping of names of parameters to values"
+            raise TypeError(f"{name} in {self.path} must return {expected}, got {type(result).__name__}.")
+        return result
 
 
 def models_folder() -> Path:
     """Return the folder of the shipped model files: in a wheel, or in the checkout."""
     package = Path(__file__).resolve().parent.parent
-    installed = package / "_models"
-    return installed if installed.is_dir() else package.parent / "models"
+    return package / "_models" if (package / "_models").is_dir() else package.parent / "models"
 
 
 def available() -> dict[str, Path]:
     """Return the shipped models: name -> file."""
-    files = sorted(models_folder().glob("*.py"))
-    return {_name(path): path for path in files if not path.name.startswith("_")}
+    return {_name(path): path for path in sorted(models_folder().glob("*.py")) if not path.name.startswith("_")}
 
 
 def load(name: str) -> ModelFile:
     """Load a model by name or by path, and check what it defines.
 
     Args:
-        name: a shipped model (``ginzburg-landau``, dashes or underscores), or the path of a Python
-            file (anything that ends in .py or contains a path separator).
-
-    Returns:
-        The model file.
+        name: a shipped model (``ginzburg-landau``, dashes or underscores), or the path of a Python file (anything that
+            ends in .py or contains a path separator).
 
     Raises:
-        ValueError: for an unknown name (with the nearest ones), a file that is missing, does not
-            run, or lacks what it must define.
-
-    Example:
-        >>> load("ginzburg-landau").name
-        'ginzburg-landau'
+        ValueError: an unknown name, or a file that is missing, does not run, or lacks what it must define.
     """
     if name.endswith(".py") or os.sep in name:
-        path = Path(name).expanduser()
+        path = Path(name).expanduser().resolve()
         if not path.is_file():
             raise ValueError(f"there is no model file {name}.")
-        return _checked(path.resolve(), _execute(path.resolve()))
+        return _checked(path, _execute(path))
     shipped = available()
-    normalized = name.replace("_", "-")
-    if normalized not in shipped and Path(f"{name}.py").is_file():
-        raise ValueError(f"unknown model {name!r}. Did you mean the file {name}.py?")
-    if normalized not in shipped:
-        message = checks.unknown("model", name, shipped)
-        raise ValueError(f"{message} A model of your own is given by its path, as in ./{name}.py.")
-    return _checked(shipped[normalized], _execute(shipped[normalized]))
+    path = shipped.get(name.replace("_", "-"), Path())
+    if not path.is_file():
+        hint = (f"unknown model {name!r}. Did you mean the file {name}.py?" if Path(f"{name}.py").is_file() else
+                f"{checks.unknown('model', name, shipped)} A model of your own has a path, as ./{name}.py.")
+        raise ValueError(hint)
+    return _checked(path, _execute(path))
 
 
 def _execute(path: Path) -> ModuleType:
-    """Run a file as a module of its own, named so that it cannot hide another module."""
-    name = f"{_MODULE}{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
+    """Run a file as a module of its own, whose name cannot hide another module."""
+    spec = importlib.util.spec_from_file_location(f"{_MODULE}{path.stem}", path)
     if spec is None or spec.loader is None:
         raise ValueError(f"{path} is not a Python file.")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # a dataclass or an equinox Module looks itself up there
+    sys.modules[spec.name] = module  # a dataclass or an equinox Module looks itself up there
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        del sys.modules[name]
-        raise ValueError(f"{path} does not run: {_where(error, path)}") from error
+        del sys.modules[spec.name]
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
+        prefix = f"line {line}: " if line else ""
+        raise ValueError(f"{path} does not run: {prefix}{type(error).__name__}: {error}") from error
     return module
 
 
 def _checked(path: Path, module: ModuleType) -> ModelFile:
-    functions = {
-        key: value
-        for key, value in vars(module).items()
-        if callable(value) and getattr(value, "__module__", "") == module.__name__
-    }
-    if "model" not in functions:
-        raise ValueError(
-            f"{path} defines no function model(times, y=None, **options); its own functions are: "
-            f"{', '.join(functions) or 'none'}. Rename the NumPyro model function to `model`."
-        )
+    """Return a model file; ValueError names a definition of a wrong form."""
+    definitions = MappingProxyType(vars(module))
+
+    def get(name: str, default: Any, expected: str, is_valid: Callable[[Any], bool]) -> Any:
+        value = definitions.get(name, default)
+        if not (value is default or is_valid(value)):
+            raise ValueError(f"{path}: {name} must be {expected}, got {value!r}.")
+        return value
+
+    def is_mapping(value: Any) -> bool:
+        return isinstance(value, Mapping)
+
+    model = definitions.get("model")
+    if not callable(model) or getattr(model, "__module__", "") != module.__name__:
+        functions = [name for name, value in definitions.items()
+                     if callable(value) and getattr(value, "__module__", "") == module.__name__]
+        raise ValueError(f"{path} defines no function model(times, y=None, **options); its functions are: "
+                         f"{', '.join(functions) or 'none'}. Rename the NumPyro model function to `model`.")
     for name in ("simulate", "prepare", "anchors"):
-        if not callable(getattr(module, name, print)):
-            raise ValueError(f"{path}: {name} must be a function, got {getattr(module, name)!r}.")
-    description = (module.__doc__ or "").strip()
-    outputs = getattr(module, "OUTPUTS", None)
-    named = isinstance(outputs, (tuple, list)) and all(isinstance(name, str) for name in outputs)
-    if outputs is not None and not (named and outputs):
-        example = outputs if isinstance(outputs, str) else "x"
-        raise ValueError(f'{path}: OUTPUTS must be a tuple of names, as in ("{example}",), got {outputs!r}.')
-    for name in ("UNITS", "PARAMETERS", "OPTIONS"):
-        if not isinstance(getattr(module, name, {}), Mapping):
-            raise ValueError(f"{path}: {name} must be a mapping, a dict, got {getattr(module, name)!r}.")
-    target_accept = getattr(module, "TARGET_ACCEPT", None)
-    if target_accept is not None and not (isinstance(target_accept, int | float) and 0 < target_accept < 1):
-        raise ValueError(f"{path}: TARGET_ACCEPT must lie between 0 and 1, got {target_accept!r}.")
+        get(name, None, "a function", callable)
+    options = get("OPTIONS", {}, "a mapping", is_mapping)
+    for name, option in options.items():
+        form = isinstance(option, tuple) and len(option) == 3 and isinstance(option[1], tuple | type)
+        if not form or isinstance(option[1], tuple) and option[0] not in option[1]:
+            raise ValueError(f"{path}: OPTIONS[{name!r}] must be (default, tuple of choices or a type, help), with the "
+                             f"default among the choices, got {option!r}.")
+    outputs = get("OUTPUTS", None, 'a tuple of names, as in ("x",)', lambda value: (
+        isinstance(value, (tuple, list)) and value and all(isinstance(name, str) for name in value)))
     loaded = ModelFile(
-        name=_name(path),
-        path=path,
-        summary=description.partition("\n")[0],
-        description=description,
-        model=functions["model"],
-        outputs=None if outputs is None else tuple(outputs),
-        units=dict(getattr(module, "UNITS", {})),
-        options=_checked_options(path, getattr(module, "OPTIONS", {})),
-        parameters=dict(getattr(module, "PARAMETERS", {})),
-        inputs=_checked_inputs(path, getattr(module, "INPUTS", {})),
-        target_accept=target_accept,
-        _simulate=getattr(module, "simulate", None),
-        _prepare=getattr(module, "prepare", None),
-        _anchors=getattr(module, "anchors", None),
-        _names=vars(module),
-    )
-    parameters = inspect.signature(loaded.model).parameters
-    keywords = {name: None for name in ("outputs", "units", "inputs") if name in parameters}
-    _check_call(path, "model", loaded.model, "(times, y=None) and the names in OPTIONS", None, None,
-                **{name: None for name in loaded.options}, **keywords)
+        path, definitions, model, None if outputs is None else tuple(outputs),
+        get("INPUTS", {}, f"a mapping of names to one of {', '.join(INTERPOLATIONS)}", lambda value: (
+            is_mapping(value) and all(way in INTERPOLATIONS for way in value.values()))),
+        get("UNITS", {}, "a mapping", is_mapping), options, get("PARAMETERS", {}, "a mapping", is_mapping),
+        get("TARGET_ACCEPT", None, "a number between 0 and 1", lambda value: (
+            isinstance(value, int | float) and 0 < value < 1)))
+    parameters = inspect.signature(model).parameters
+    _check_signature(path, definitions, "model", None, None, **dict.fromkeys(options),
+                     **{name: None for name in ("outputs", "units", "inputs") if name in parameters})
     return loaded
 
 
-def _check_call(path: Path, name: str, function: Callable, form: str, *arguments: Any, **keywords: Any) -> None:
-    """Raise ValueError unless a function of a model file takes these arguments; ``form`` says which it must take."""
+_ARGUMENTS = {"model": "(times, y=None) and the names in OPTIONS", "simulate": "seed and the names in OPTIONS",
+              "prepare": "the data", "anchors": "the data"}
+
+
+def _check_signature(path: Path, definitions: Mapping[str, Any], name: str, *arguments: Any, **keywords: Any) -> None:
+    """Raise ValueError unless a function of a model file takes these arguments."""
     try:
-        inspect.signature(function).bind(*arguments, **keywords)
+        inspect.signature(definitions[name]).bind(*arguments, **keywords)
     except TypeError as error:
-        raise ValueError(f"{path}: {name} must take {form}: {error}.") from None
+        raise ValueError(f"{path}: {name} must take {_ARGUMENTS[name]}: {error}.") from None
 
 
-def _checked_options(path: Path, options: Mapping[str, Any]) -> dict[str, tuple[Any, Any, str]]:
-    for name, entry in options.items():
-        valid = isinstance(entry, tuple) and len(entry) == 3 and isinstance(entry[1], tuple | type)
-        if not valid:
-            raise ValueError(
-                f"{path}: OPTIONS[{name!r}] must be (default, tuple of choices or a type, help), "
-                f"got {entry!r}."
-            )
-        if isinstance(entry[1], tuple) and entry[0] not in entry[1]:
-            raise ValueError(f"{path}: the default of OPTIONS[{name!r}] must be one of its choices {entry[1]!r}, got "
-                             f"{entry[0]!r}.")
-    return dict(options)
-
-
-def _checked_inputs(path: Path, inputs: Any) -> dict[str, str]:
-    valid = isinstance(inputs, Mapping) and all(way in INTERPOLATIONS for way in inputs.values())
-    if not valid:
-        raise ValueError(f"{path}: INPUTS must be a mapping of names to one of {', '.join(INTERPOLATIONS)}, as in "
-                         f'{{"heater": "previous"}}, got {inputs!r}.')
-    return dict(inputs)
-
-
-def _convert(kind: type, text: str) -> Any:
-    if kind is bool:
-        booleans = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
-        if text.lower() not in booleans:
-            raise ValueError(text)
-        return booleans[text.lower()]
-    return kind(text)
-
-
-@dataclass(frozen=True)
-class SourceLocation:
-    """A line of a model file.
-
-    Attributes:
-        file: its path.
-        line: counted from 1.
-        shipped: whether the file comes with the library.
-    """
+class SourceLocation(NamedTuple):
+    """A line of a model file, and whether the file comes with the library."""
 
     file: str
     line: int
@@ -366,17 +289,5 @@ def known_inputs(error: KeyError) -> tuple[str, ...] | None:
     return None
 
 
-def _where(error: BaseException, path: Path) -> str:
-    """Return the error in one line, with the last line of ``path`` that led to it."""
-    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
-    line = error.lineno if isinstance(error, SyntaxError) else (lines[-1] if lines else None)
-    prefix = f"line {line}: " if line else ""
-    return f"{prefix}{type(error).__name__}: {error}"
-
-
 def _name(path: Path) -> str:
     return path.stem.replace("_", "-")
-
-
-def _type(value: Any) -> str:
-    return type(value).__name__

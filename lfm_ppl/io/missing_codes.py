@@ -1,0 +1,57 @@
+"""Numbers that stand for missing values, such as -9, 99, -999.9, -999.25, 7777, 1e30 and -32768."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from lfm_ppl.io.table import Table
+from lfm_ppl.utils import checks
+
+_INTEGER_LIMITS = tuple(float(sign * (2**bits - shift)) for bits in (15, 16, 31, 32, 63) for sign in (1, -1)
+                        for shift in (0, 1))
+# 9, 9.9 and 77 are too usual as measurements; -9 and 9.99 are codes of fixed-width formats, 999.25 of well logs.
+_CODE = re.compile(r"-9(\.9)?|-?(99+(\.9+)?|9\.99+|9{3,5}\.25)|(-|7)77+(\.7+)?|(-|8)88+(\.8+)?")
+_FAR_RANGES = 5.0  # ranges of the other values from which on a code is far from them, however they are spread
+_FAR_GAPS = 5.0  # largest gaps within the other values from which on a code that is a range away is far from them
+
+
+def _looks_like_code(value: float) -> bool:
+    if abs(value) >= 1e30 or value in _INTEGER_LIMITS:
+        return True
+    texts = [f"{value:.{digits}g}".partition("e") for digits in (7, 15)]  # of single and of double precision
+    return any(_CODE.fullmatch(mantissa) and not exponent.startswith("-") or
+               mantissa.strip("-") == "1" and int(exponent or 0) >= 10 for mantissa, _, exponent in texts)
+
+
+def _codes(column: np.ndarray) -> list[float]:
+    """Return the numbers in a column (T,) that look like codes and are far from all other numbers.
+
+    1. Candidates are the smallest and largest numbers, as long as they look like codes.
+    2. A candidate that is not far from the rest joins the rest; this repeats until all candidates are far.
+    """
+    values = np.unique(column[np.isfinite(column)])
+    is_code = np.array([_looks_like_code(value) for value in values], bool)
+    is_candidate = np.logical_and.accumulate(is_code) | np.logical_and.accumulate(is_code[::-1])[::-1]
+    with np.errstate(over="ignore"):  # differences of the largest numbers
+        while is_candidate.any() and not is_candidate.all():
+            rest = values[~is_candidate]
+            distance, gap = np.maximum(rest[0] - values, values - rest[-1]), np.diff(rest).max(initial=0.0)
+            is_far = (distance > _FAR_RANGES * np.ptp(rest)) | (distance > np.maximum(np.ptp(rest), _FAR_GAPS * gap))
+            # -999 among flows of 0 to 5,000 is less than their range away from them, but negative.
+            is_far |= (values <= -99) & (rest[0] >= 0) & (distance > gap)
+            if is_far[is_candidate].all():
+                return values[is_candidate].tolist()
+            is_candidate &= is_far
+    return []
+
+
+def warn_of_codes(table: Table, name: str, column: np.ndarray) -> None:
+    """Warn of numbers in a column (T,) that seem to stand for missing values."""
+    for code in _codes(column):
+        count = int(np.sum(column == code))
+        if np.isfinite(column).sum() - count >= 2:
+            location = table.location(int(np.argmax(column == code)), name)
+            checks.warn(f"{location}: {code:g}, far from all other values of the column, is taken as a measurement "
+                        f"({count} of them). If it stands for a missing value, leave the cell empty.")
