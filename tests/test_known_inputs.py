@@ -130,7 +130,7 @@ def test_a_model_of_known_inputs_is_described_without_data():
     ({"inputs": "heater,heater"}, "each of them once"),
     ({"inputs": "heater,outsid"}, "unknown input column 'outsid'. Did you mean 'outside'"),
     ({"inputs": "heater,outside:cubic"}, "unknown interpolation of outside 'cubic'"),
-    ({"inputs": "heater,indoor"}, "'indoor' is named as an output and as an input"),
+    ({"inputs": "heater,indoor"}, "as an output or an input; got .*'indoor'"),
     ({"inputs": None}, "unknown input column 'power'"),
     ({"data": None}, "--outputs is about a data file"),
     ({"data": None, "outputs": None}, "--inputs is about a data file"),
@@ -142,11 +142,11 @@ def test_wrong_inputs_are_named(folder, changed, message):
 
 @pytest.mark.parametrize(("text", "message"), [
     ("date,x,h\n2026-01-05,1,\n2026-01-06,2,1\n", "row 2, column 'h': the known input has no value at the first time"),
-    ("date,x,h\n2026-01-05,1,1\n2026-01-05,2,3\n", "row 3, column 'h': the known input is 3 here and 1 in another row"),
+    ("date,x,h\n2026-01-05,1,1\n2026-01-05,2,3\n", "row 3, column 'h': the known input has another value"),
     ("date,x,h\n2026-01-05,1,1\n2026-01-32,2,3\n", "row 3, column 'date': expected a date, year .* got '2026-01-32'"),
-    ("date,x,h\n2026-01-05,1,1\n2026-01-06T00:00Z,2,3\n", "row 3, column 'date': some dates have an offset from UTC"),
+    ("date,x,h\n2026-01-05,1,1\n2026-01-06T00:00Z,2,3\n", "row 3, column 'date': .* without an offset from UTC"),
     ("date,x,h\n2026-01-05,1,1\n,2,3\n", "row 3, column 'date': the time is missing"),
-    ("date,x,h\n2026-10-25 02:30,1,1\n2026-10-25 02:15,2,3\n", "row 3: the time goes back .* needs offsets from UTC"),
+    ("date,x,h\n2026-10-25 02:30,1,1\n2026-10-25 02:15,2,3\n", "row 3: the time goes back .* offsets from UTC"),
     ("a,b,x,h\n2026-01-05,2026-01-05,1,1\n", "several time columns: a, b"),
     ("a,x,h\n1,1,1\n", "has no time column; expected `time`, `t`, `time_h`, or one of dates"),
     ("time_h,x,h\n1,1,1\n", "the column 'time_h' says that its unit is h, and --time-unit"),
@@ -186,7 +186,7 @@ def test_tables_of_other_libraries_are_read(frame):
 
 @pytest.mark.parametrize(("frame", "error", "message"), [
     ([1, 2], TypeError, "expected a pandas or polars DataFrame.*got list"),
-    ({}, ValueError, "columns of 0 rows"),
+    ({}, ValueError, "no rows"),
     ({"t": [0, 1], "x": [1]}, ValueError, "columns of 1 and 2 rows"),
     (pd.DataFrame([[1, 2]], columns=["x", "x"]), ValueError, "the column name 'x' stands 2 times"),
     (xr.Dataset({"x": (("time", "gene"), np.ones((2, 2)))}), ValueError, "expected the time alone"),

@@ -16,16 +16,9 @@ from lfm_ppl.io.table import Table, is_missing
 from lfm_ppl.utils import calendar_time, checks
 
 
-def read_csv(
-    path: str | Path,
-    outputs: Sequence[str] | None = None,
-    time_column: str | None = None,
-    inputs: Sequence[str] | Mapping[str, str] = (),
-    time_unit: str | None = None,
-    *,
-    usual_unit: str | None = None,
-    observed: bool = True,
-) -> Data:
+def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column: str | None = None,
+             inputs: Sequence[str] | Mapping[str, str] = (), time_unit: str | None = None, *,
+             usual_unit: str | None = None, observed: bool = True) -> Data:
     r"""Read observations and known inputs from a comma-separated file.
 
     Args:
@@ -47,13 +40,11 @@ def read_csv(
         each row, or in none) become numbers since the midnight before the first of them, which is the `Data.origin`.
 
     Raises:
-        ValueError: with file, row and column, for a file that is empty or not comma-separated text, a missing,
-            ambiguous or repeated column, text in a number column, a time that is empty, not finite or goes back, and
-            a file without any value.
+        ValueError: the file is no comma-separated text, a column is missing, ambiguous or repeated, or a cell has no
+            number or no date, or a time goes back.
 
     Warns:
-        UserWarning: a number that looks like a code of missing values, such as -9999 or 1e30, lies far from all others
-            of its column; empty cells of a known input.
+        UserWarning: a number such as -9999 seems to stand for a missing value; a known input has empty cells.
 
     Example:
         >>> import pathlib, tempfile
@@ -70,13 +61,8 @@ def read_csv(
     return _read(tables.read_file(path), outputs, time_column, inputs, time_unit, usual_unit, observed=observed)
 
 
-def read_table(
-    frame: Any,
-    outputs: Sequence[str] | None = None,
-    time_column: str | None = None,
-    inputs: Sequence[str] | Mapping[str, str] = (),
-    time_unit: str | None = None,
-) -> Data:
+def read_table(frame: Any, outputs: Sequence[str] | None = None, time_column: str | None = None,
+               inputs: Sequence[str] | Mapping[str, str] = (), time_unit: str | None = None) -> Data:
     """Read observations and known inputs from a table in memory.
 
     Args:
@@ -179,16 +165,17 @@ def _read(table: Table, outputs: Sequence[str] | None, time_column: str | None,
 
 def _time_column(table: Table, time_column: str | None) -> str:
     header = list(table.frame)
-    if time_column is not None:
-        checks.one_of(f"time column of {table.label}", time_column, header, checks.ABBREVIATIONS)
-        return time_column
+    if time_column is not None and time_column not in header:
+        unknown = checks.unknown("time column", time_column, header, checks.ABBREVIATIONS)
+        raise ValueError(f"{table.label}: {unknown}")
     first_cells = {name: next((cell for cell in table.frame[name] if not is_missing(cell)), None) for name in header}
-    candidates = ([name for name in header if name.lower() == "time" or name == "t" or _unit_of(name)]
+    candidates = ([name for name in header if name == time_column]
+                  or [name for name in header if name.lower() == "time" or name == "t" or _unit_of(name)]
                   or [name for name in header if name.lower() in ("date", "datetime", "timestamp")]
                   or [name for name in header if calendar_time.is_date(first_cells[name])])
     if len(candidates) != 1:
-        problem = (f"several time columns: {', '.join(candidates)}" if candidates else
-                   f"no time column; expected `time`, `t`, `time_h`, or one of dates, got the columns {', '.join(header)}")
+        problem = f"several time columns: {', '.join(candidates)}" if candidates else (
+            f"no time column; expected `time`, `t`, `time_h`, or one of dates, got the columns {', '.join(header)}")
         raise ValueError(f"{table.label} has {problem}. Name it with --time-column (time_column=).")
     return candidates[0]
 
@@ -201,14 +188,9 @@ def _unit_of(time_name: str) -> str | None:
 
 def _times(table: Table, name: str, unit: str | None, usual: str | None,
            free: Sequence[str]) -> tuple[np.ndarray, str | None, str | None]:
-    """Return times (T,), their unit and their origin, None where the table does not say.
+    """Return times (T,), their unit and their origin, None where the table does not say, see `read_csv`.
 
-    Args:
-        table: the table.
-        name: of the time column.
-        unit: of times that are dates.
-        usual: the default of ``unit``.
-        free: columns that may hold identifiers of series.
+    ``free`` are the columns that may hold identifiers of series.
     """
     cells = table.frame[name].to_numpy()
     for row in np.flatnonzero([is_missing(cell) for cell in cells])[:1]:
@@ -242,8 +224,8 @@ def _input(table: Table, name: str, interpolation: str, times: np.ndarray) -> In
     values = table.numbers(name)
     remedy = f"--inputs {name}:zero (inputs={{{name!r}: 'zero'}})"
     if interpolation != "zero" and np.isnan(values[times == times[0]]).all():
-        raise ValueError(f"{table.location(0, name)}: the known input has no value at the first time; fill the cell, or "
-                         f"read empty cells as zero: {remedy}.")
+        raise ValueError(f"{table.location(0, name)}: the known input has no value at the first time; fill the cell, "
+                         f"or read empty cells as zero: {remedy}.")
     warn_of_codes(table, name, values)
     values = fill_blanks(f"{table.label}, column {name!r}", remedy, times, values, interpolation)
     rows = np.flatnonzero(np.isfinite(values))

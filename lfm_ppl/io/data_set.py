@@ -1,9 +1,4 @@
-"""Data sets: times, observations, known inputs, units, and the truth of simulated data.
-
-1. `Data` checks shapes, and converts dates to numbers in the model's unit of time.
-2. Known inputs are tables with an interpolation; blank cells are interpolated, or zero.
-3. Data sets of one record are put on one origin of time (`on_clock_of`).
-"""
+"""Data sets: times, observations, known inputs, units, and the truth of simulated data."""
 
 from __future__ import annotations
 
@@ -141,26 +136,14 @@ def model_keywords(tables: Mapping[str, InputTable], model_kwargs: Mapping[str, 
 
 
 def on_clock_of(data: Data, reference: Data) -> Data:
-    """Return data with their times counted from the origin of other data, in their unit.
-
-    Raises:
-        ValueError: the times of one are dates and of the other plain numbers, or only one has an offset from UTC.
-    """
-    if data.origin is None and reference.origin is None:
-        return data
-    if data.origin is None or reference.origin is None:
-        dated, plain = ("first", "others") if data.origin else ("others", "first")
-        raise ValueError(f"the times of two tables cannot be compared: the times of the {dated} are dates, "
-                         f"the times of the {plain} plain numbers.")
-    return at_origin(data, reference.origin, reference.units["time"])
+    """Return data with their times counted from the origin of other data, in their unit."""
+    if (data.origin is None) != (reference.origin is None):
+        raise ValueError("the times of two tables cannot be compared: they are dates in one and numbers in the other.")
+    return data if reference.origin is None else at_origin(data, reference.origin, reference.units["time"])
 
 
 def at_origin(data: Data, origin: str, unit: str) -> Data:
-    """Return data, whose times were dates, with their times counted from another origin, in another unit.
-
-    Raises:
-        ValueError: only one of the origins has an offset from UTC.
-    """
+    """Return data, whose times were dates, with their times counted from another origin, in another unit."""
     ratio = calendar_time.SECONDS[data.units["time"]] / calendar_time.SECONDS[unit]
     shift = float(calendar_time.positions("origin", data.origin, origin, unit))
     truth = data.truth
@@ -174,14 +157,8 @@ def at_origin(data: Data, origin: str, unit: str) -> Data:
 def fill_blanks(label: str, remedy: str, times: np.ndarray, values: np.ndarray, interpolation: str) -> np.ndarray:
     """Return the values (K,) of a known input, with zeros for NaN where the interpolation is "zero".
 
-    Otherwise warn of NaN, over which the input is interpolated. NaN beside a number of the same time counts as filled.
-
-    Args:
-        label: name of the input in the warning.
-        remedy: how to read blank values as zero.
-        times: (K,).
-        values: (K,).
-        interpolation: one of `INTERPOLATIONS`.
+    Otherwise warn of NaN, over which the input is interpolated; ``remedy`` says how to read them as zero. NaN beside a
+    number of the same time counts as filled.
     """
     is_blank = np.isnan(values) & ~np.isin(times, times[np.isfinite(values)])
     if interpolation == "zero":

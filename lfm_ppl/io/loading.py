@@ -44,6 +44,9 @@ class ModelFile:
     """A model file that has been loaded and checked.
 
     Attributes:
+        name: ``ginzburg-landau`` for ``ginzburg_landau.py``.
+        summary: the first line of the docstring.
+        description: the docstring.
         path: the file.
         definitions: functions and constants of the file, and other names in it.
         model: the NumPyro model function.
@@ -55,6 +58,9 @@ class ModelFile:
         target_accept: target acceptance of NUTS; None for its default.
     """
 
+    name: str
+    summary: str
+    description: str
     path: Path
     definitions: Mapping[str, Any] = field(repr=False, compare=False)
     model: Callable[..., None]
@@ -64,21 +70,6 @@ class ModelFile:
     options: Mapping[str, tuple[Any, Any, str]]
     parameters: Mapping[str, str]
     target_accept: float | None
-
-    @property
-    def name(self) -> str:
-        """``ginzburg-landau`` for ``ginzburg_landau.py``."""
-        return _name(self.path)
-
-    @property
-    def description(self) -> str:
-        """The docstring of the file."""
-        return (self.definitions["__doc__"] or "").strip()
-
-    @property
-    def summary(self) -> str:
-        """The first line of the docstring."""
-        return self.description.partition("\n")[0]
 
     @property
     def can_simulate(self) -> bool:
@@ -160,27 +151,22 @@ def available() -> dict[str, Path]:
 
 
 def load(name: str) -> ModelFile:
-    """Load a model by name or by path, and check what it defines.
+    """Load a shipped model (``ginzburg-landau``, dashes or underscores) or the file at a path, and check it.
 
-    Args:
-        name: a shipped model (``ginzburg-landau``, dashes or underscores), or the path of a Python file (anything that
-            ends in .py or contains a path separator).
-
-    Raises:
-        ValueError: an unknown name, or a file that is missing, does not run, or lacks what it must define.
+    A path ends in .py or contains a separator. Raises ValueError for an unknown name, and for a file that is missing,
+    does not run, or does not define a model.
     """
     if name.endswith(".py") or os.sep in name:
         path = Path(name).expanduser().resolve()
         if not path.is_file():
             raise ValueError(f"there is no model file {name}.")
         return _checked(path, _execute(path))
-    shipped = available()
-    path = shipped.get(name.replace("_", "-"), Path())
-    if not path.is_file():
-        hint = (f"unknown model {name!r}. Did you mean the file {name}.py?" if Path(f"{name}.py").is_file() else
-                f"{checks.unknown('model', name, shipped)} A model of your own has a path, as ./{name}.py.")
-        raise ValueError(hint)
-    return _checked(path, _execute(path))
+    shipped, shipped_name = available(), name.replace("_", "-")
+    if shipped_name not in shipped:
+        if Path(f"{name}.py").is_file():
+            raise ValueError(f"unknown model {name!r}. Did you mean the file {name}.py?")
+        raise ValueError(f"{checks.unknown('model', name, shipped)} A model of your own has a path, as ./{name}.py.")
+    return _checked(shipped[shipped_name], _execute(shipped[shipped_name]))
 
 
 def _execute(path: Path) -> ModuleType:
@@ -201,46 +187,44 @@ def _execute(path: Path) -> ModuleType:
     return module
 
 
+_FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    **dict.fromkeys(("simulate", "prepare", "anchors"), ("a function", callable)),
+    **dict.fromkeys(("UNITS", "PARAMETERS", "OPTIONS"), ("a mapping", lambda value: isinstance(value, Mapping))),
+    "OUTPUTS": ('a tuple of names, as in ("x",)', lambda value: (
+        isinstance(value, (tuple, list)) and len(value) > 0 and all(isinstance(name, str) for name in value))),
+    "INPUTS": (f"a mapping of names to one of {', '.join(INTERPOLATIONS)}", lambda value: (
+        isinstance(value, Mapping) and all(interpolation in INTERPOLATIONS for interpolation in value.values()))),
+    "TARGET_ACCEPT": ("between 0 and 1", lambda value: isinstance(value, int | float) and 0 < value < 1)}
+"""Definition of a model file -> its form, and whether a value has it."""
+
+
 def _checked(path: Path, module: ModuleType) -> ModelFile:
     """Return a model file; ValueError names a definition of a wrong form."""
-    definitions = MappingProxyType(vars(module))
-
-    def get(name: str, default: Any, expected: str, is_valid: Callable[[Any], bool]) -> Any:
-        value = definitions.get(name, default)
-        if not (value is default or is_valid(value)):
-            raise ValueError(f"{path}: {name} must be {expected}, got {value!r}.")
-        return value
-
-    def is_mapping(value: Any) -> bool:
-        return isinstance(value, Mapping)
-
-    model = definitions.get("model")
-    if not callable(model) or getattr(model, "__module__", "") != module.__name__:
-        functions = [name for name, value in definitions.items()
-                     if callable(value) and getattr(value, "__module__", "") == module.__name__]
+    definitions = {name: value for name, value in vars(module).items() if name not in _FORMS or value is not None}
+    functions = {name: value for name, value in definitions.items()
+                 if callable(value) and getattr(value, "__module__", "") == module.__name__}
+    if "model" not in functions:
         raise ValueError(f"{path} defines no function model(times, y=None, **options); its functions are: "
                          f"{', '.join(functions) or 'none'}. Rename the NumPyro model function to `model`.")
-    for name in ("simulate", "prepare", "anchors"):
-        get(name, None, "a function", callable)
-    options = get("OPTIONS", {}, "a mapping", is_mapping)
+    for name, (form, is_valid) in _FORMS.items():
+        if name in definitions and not is_valid(definitions[name]):
+            raise ValueError(f"{path}: {name} must be {form}, got {definitions[name]!r}.")
+    options = definitions.get("OPTIONS", {})
     for name, option in options.items():
-        form = isinstance(option, tuple) and len(option) == 3 and isinstance(option[1], tuple | type)
-        if not form or isinstance(option[1], tuple) and option[0] not in option[1]:
+        is_valid = isinstance(option, tuple) and len(option) == 3 and isinstance(option[1], tuple | type)
+        if not is_valid or isinstance(option[1], tuple) and option[0] not in option[1]:
             raise ValueError(f"{path}: OPTIONS[{name!r}] must be (default, tuple of choices or a type, help), with the "
                              f"default among the choices, got {option!r}.")
-    outputs = get("OUTPUTS", None, 'a tuple of names, as in ("x",)', lambda value: (
-        isinstance(value, (tuple, list)) and value and all(isinstance(name, str) for name in value)))
-    loaded = ModelFile(
-        path, definitions, model, None if outputs is None else tuple(outputs),
-        get("INPUTS", {}, f"a mapping of names to one of {', '.join(INTERPOLATIONS)}", lambda value: (
-            is_mapping(value) and all(way in INTERPOLATIONS for way in value.values()))),
-        get("UNITS", {}, "a mapping", is_mapping), options, get("PARAMETERS", {}, "a mapping", is_mapping),
-        get("TARGET_ACCEPT", None, "a number between 0 and 1", lambda value: (
-            isinstance(value, int | float) and 0 < value < 1)))
-    parameters = inspect.signature(model).parameters
+    parameters = inspect.signature(functions["model"]).parameters
     _check_signature(path, definitions, "model", None, None, **dict.fromkeys(options),
                      **{name: None for name in ("outputs", "units", "inputs") if name in parameters})
-    return loaded
+    description = (module.__doc__ or "").strip()
+    return ModelFile(
+        _name(path), description.partition("\n")[0], description, path, MappingProxyType(definitions),
+        functions["model"],
+        outputs=tuple(definitions["OUTPUTS"]) if "OUTPUTS" in definitions else None, options=options,
+        **{name.lower(): definitions.get(name, {}) for name in ("INPUTS", "UNITS", "PARAMETERS")},
+        target_accept=definitions.get("TARGET_ACCEPT"))
 
 
 _ARGUMENTS = {"model": "(times, y=None) and the names in OPTIONS", "simulate": "seed and the names in OPTIONS",

@@ -18,8 +18,8 @@ from lfm_ppl.utils import checks
 if TYPE_CHECKING:  # imported where a table is read: `lfm-ppl --help` does not need pandas
     import pandas as pd
 
-_NUMBER = ("expected a finite number, or an empty cell where it is missing, got {}. If the model does not take this "
-           "column, name those it takes: outputs and inputs.")
+_NUMBER = ("expected a finite number, got {}. Leave an empty cell where a value is missing; if the model does not take "
+           "this column, name those it takes: outputs and inputs.")
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,7 @@ class Table:
         return f"{self.label}, row {self.frame.index[row]}, column {column!r}"
 
     def numbers(self, column: str, requirement: str = _NUMBER) -> np.ndarray:
-        """Return the numbers (T,) of a column, NaN where they are missing.
-
-        Raises:
-            ValueError: a cell without a number, which stands for {} in the requirement.
-        """
+        """Return the numbers (T,) of a column, NaN where they are missing; ValueError for a cell without a number."""
         values = np.array([_number(cell) for cell in self.frame[column]])
         for row in np.flatnonzero(np.isinf(values))[:1]:
             cell = self.frame[column].iloc[row]
@@ -76,11 +72,7 @@ def _remedy(cell: str) -> str:
 
 
 def read_file(path: str | Path) -> Table:
-    """Read a comma-separated file; rows are numbered as an editor counts them.
-
-    Raises:
-        ValueError: it is not comma-separated text, or has no rows, rows of different lengths or repeated names.
-    """
+    """Read a comma-separated file; rows are numbered as an editor counts them."""
     import pandas as pd
 
     try:
@@ -91,7 +83,10 @@ def read_file(path: str | Path) -> Table:
             rows = {line: cells for line, cells in numbered if any(cells) and not cells[0].startswith("#")}
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not a comma-separated text file (UTF-8): {error}.") from None
-    first, header = next(iter(rows.items()), (1, []))
+    if len(rows) < 2:
+        raise ValueError(f"{path} {'has a header and no rows' if rows else 'is empty'}; expected a header row and one "
+                         "row per time.")
+    first, header = next(iter(rows.items()))
     if len(header) < 2 or header[0].startswith("<"):
         raise ValueError(f"{path}, row {first}: expected the names of columns, with commas between them, got "
                          f"{','.join(header)[:40]!r}. Export it as comma-separated CSV, with a point in decimals.")
@@ -100,17 +95,13 @@ def read_file(path: str | Path) -> Table:
             raise ValueError(f"{path}, row {line}: {len(cells)} cells, but the header has {len(header)} columns. Leave "
                              "a missing value empty, and write decimals with a point.")
     del rows[first]
-    return _checked(f"{path}", pd.DataFrame(list(rows.values()), list(rows), header, dtype=object))
+    return _checked(str(path), pd.DataFrame(list(rows.values()), list(rows), header, dtype=object))
 
 
 def from_frame(value: Any) -> Table:
     """Read a pandas DataFrame or Series, a polars DataFrame, an xarray Dataset or DataArray, or a mapping of columns.
 
     An index or coordinate that has a name, or holds dates, is a column like the others; rows are numbered from 0.
-
-    Raises:
-        TypeError: another kind of object.
-        ValueError: it has no rows, or repeated names.
     """
     import pandas as pd
 

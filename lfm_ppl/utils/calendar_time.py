@@ -20,14 +20,16 @@ USUAL = tuple(_SPELLINGS)  # the spellings that the library prints
 UNITS = {spelling: unit for unit, (_, others) in _SPELLINGS.items() for spelling in (unit, *others.split())}
 SECONDS = {spelling: _SPELLINGS[unit][0] for spelling, unit in UNITS.items()}
 _SMALLEST_GAPS = {"years": 300 * 86400.0, "d": 86400.0, "h": 3600.0, "min": 60.0, "s": 0.0}  # in seconds
-_ISO_DATE = re.compile(r"(?=.*[-:])\d{4}-?\d\d-?\d\d([\sT][\d:.]*)?\s*(?P<offset>Z|[+-]\d\d:?(\d\d)?)?")
+_ISO_DATE = re.compile(r"\s*(?=.*[-:])\d{4}-?\d\d-?\d\d([\sT][\d:.]*)?\s*(?P<offset>Z|[+-]\d\d:?(\d\d)?)?\s*")
 _CLOCK: ContextVar[tuple[str, str] | None] = ContextVar("clock", default=None)
 
 
 def is_date(cell: Any) -> bool:
     """Return whether a cell of a table is a date: ISO 8601 text such as 2026-03-31, not 20260331, or an object."""
-    if isinstance(cell, str):
-        return _ISO_DATE.match(cell) is not None and not _parse([cell])[0].hasnans
+    if isinstance(cell, str) and _ISO_DATE.fullmatch(cell):
+        import pandas as pd  # here, because `lfm-ppl --help` and arrays of numbers do not need it
+
+        return not pd.isna(pd.to_datetime(cell.strip(), format="ISO8601", errors="coerce"))
     return isinstance(cell, (date, np.datetime64)) or type(cell).__name__ == "Period"
 
 
@@ -51,29 +53,25 @@ def _first_cell(values: Any) -> Any:
     return next(iter(np.asarray(values).flat), None) if kind in tuple("MmOU") else None
 
 
-def _parse(cells: Any) -> tuple[Any, np.ndarray]:
-    """Return a DatetimeIndex in UTC, NaT where a cell is no date, and whether each cell has an offset from UTC."""
-    import pandas as pd  # here, because `lfm-ppl --help` and arrays of numbers do not need it
-
-    dates, has_offset = [], []
-    for cell in cells:
-        match = _ISO_DATE.fullmatch(cell.strip()) if isinstance(cell, str) else None  # pandas takes "now", too
-        dates.append(match.string if match else None if isinstance(cell, str) or not is_date(cell) else cell)
-        has_offset.append(bool(match["offset"]) if match else getattr(cell, "tzinfo", None) is not None)
-    index = pd.to_datetime(pd.Series(dates, dtype=object), format="ISO8601", errors="coerce", utc=True)
-    return pd.DatetimeIndex(index).as_unit("us"), np.array(has_offset)
-
-
 def _read(name: str, values: Any, location: Callable[[int], str] | None = None) -> tuple[np.ndarray, Any]:
-    """Return the cells, and their dates: in UTC where they have offsets, else without a time zone."""
+    """Return the cells and their dates, a DatetimeIndex in UTC where they have offsets, else without a time zone."""
+    import pandas as pd
+
     cells = np.asarray(np.ma.filled(values, np.datetime64("NaT")))
-    dates, has_offset = _parse(cells.ravel())
-    for row in np.flatnonzero(dates.isna() | (has_offset != has_offset[0]))[:1]:
+    matches = [_ISO_DATE.fullmatch(cell) if isinstance(cell, str) else None for cell in cells.flat]
+    # pandas also reads "now", and numbers as nanoseconds.
+    dates = [match[0].strip() if match else cell if is_date(cell) else None
+             for cell, match in zip(cells.flat, matches, strict=True)]
+    has_offset = np.array([bool(match["offset"]) if match else getattr(cell, "tzinfo", None) is not None
+                           for cell, match in zip(cells.flat, matches, strict=True)])
+    utc = pd.to_datetime(pd.Series(dates, dtype=object), format="ISO8601", errors="coerce", utc=True)
+    index = pd.DatetimeIndex(utc).as_unit("us")
+    for row in np.flatnonzero(index.isna() | (has_offset != has_offset[0]))[:1]:
         label = location(row) if location else f"{name}[{row}]" if cells.ndim else name
         offset = "with" if has_offset[0] else "without"
         raise ValueError(f"{label}: expected a date, year first, such as 2026-03-31T18:00, {offset} an offset from UTC "
                          f"as the first date, got {str(cells.flat[row])!r}.")
-    return cells, dates if has_offset[0] else dates.tz_localize(None)
+    return cells, index if has_offset[0] else index.tz_localize(None)
 
 
 def numbers_of(name: str, values: Any, unit: str | None = None,
@@ -106,7 +104,7 @@ def positions(name: str, values: Any, origin: str | None, unit: str) -> Any:
     start = datetime.fromisoformat(origin) if origin and unit in SECONDS else None
     if start is None:
         kind = f"numbers of {unit or 'an unknown unit'}" if origin else "plain numbers"
-        raise ValueError(f"{name} must be numbers, because the times of the data are {kind}, got {cells.flat[0]}.")
+        raise ValueError(f"{name} must be numbers, as the times of the data are {kind}, got {str(cells.flat[0])!r}.")
     if dates.tz is not None and start.tzinfo is None:
         raise ValueError(f"{name}: {cells.flat[0]} has an offset from UTC, and the times of the data have none.")
     seconds = (dates - (start if dates.tz else start.replace(tzinfo=None))).total_seconds().to_numpy()
