@@ -104,14 +104,14 @@ def read_series(path: str | Path, column: str, outputs: Sequence[str] | None = N
                 usual_unit: str | None = None) -> dict[str, Data]:
     """Read the series of one comma-separated file: identifier -> observations, in the order of the file.
 
-    A column of text, such as ``patient``, identifies the series of each row; other arguments are those of `read_csv`.
+    The text in ``column``, as in ``patient``, identifies the series of each row; other arguments: see `read_csv`.
     Rows of a series need not stand together, but their times must not go back.
     """
     table = tables.read_file(path)
     if column not in table.frame:
         raise ValueError(f"{table.label}: {checks.unknown('column of series', column, list(table.frame))}")
-    for row in np.flatnonzero(table.frame[column] == "")[:1]:
-        raise ValueError(f"{table.location(row, column)}: the identifier of the series is missing.")
+    if (rows := np.flatnonzero(table.frame[column] == "")).size:
+        raise ValueError(f"{table.location(rows[0], column)}: the identifier of the series is missing.")
     return {name: _read(Table(table.label, rows.drop(columns=column)), outputs, time_column, inputs, time_unit,
                         usual_unit, f" of series {name!r}") for name, rows in table.frame.groupby(column, sort=False)}
 
@@ -193,8 +193,8 @@ def _times(table: Table, name: str, unit: str | None, usual: str | None,
     ``free`` are the columns that may hold identifiers of series.
     """
     cells = table.frame[name].to_numpy()
-    for row in np.flatnonzero([is_missing(cell) for cell in cells])[:1]:
-        raise ValueError(f"{table.location(row, name)}: the time is missing.")
+    if (rows := np.flatnonzero([is_missing(cell) for cell in cells])).size:
+        raise ValueError(f"{table.location(rows[0], name)}: the time is missing.")
     named_unit, origin = _unit_of(name), None
     if calendar_time.is_date(cells[0]):
         times, origin, unit = calendar_time.numbers_of(name, cells, unit or named_unit or usual,
@@ -205,14 +205,15 @@ def _times(table: Table, name: str, unit: str | None, usual: str | None,
             raise ValueError(f"{table.label}: the column {name!r} says that its unit is {named_unit}, and --time-unit "
                              f"(time_unit=) says {unit}.")
         unit = named_unit or unit
-    for row in np.flatnonzero(np.diff(times) < 0)[:1] + 1:
+    if (rows := np.flatnonzero(np.diff(times) < 0)).size:
+        row = rows[0] + 1
         location = (f"{table.label}, row {table.frame.index[row]}: the time goes back from {cells[row - 1]} to "
                     f"{cells[row]}")
         if (series := _series_column(table, times, free)) is not None:
-            before, after = table.frame[series].iloc[row - 1:row + 1]
-            raise ValueError(f"{location}, where the column {series!r} changes from {before} to {after}. If it names "
-                             f"several series, fit them separately: --series {series} (lfm.data.read_series(path, "
-                             f"{series!r}), or lfm.read_table of each part of a DataFrame).")
+            labels = table.frame[series].iloc[row - 1:row + 1]
+            raise ValueError(f"{location}, where the column {series!r} changes from {' to '.join(map(str, labels))}. If "
+                             f"it names several series, fit them separately: --series {series} (lfm.data.read_series("
+                             f"path, {series!r}), or lfm.read_table of each part of a DataFrame).")
         raise ValueError(f"{location}. Sort the rows by time; replicates are rows with the same time. A clock that is "
                          "set back for winter needs offsets from UTC.")
     return times, unit, origin
@@ -231,8 +232,8 @@ def _input(table: Table, name: str, interpolation: str, times: np.ndarray) -> In
     rows = np.flatnonzero(np.isfinite(values))
     unique_times, first, inverse = np.unique(times[rows], return_index=True, return_inverse=True)
     first_values = values[rows[first]]
-    for row in rows[values[rows] != first_values[inverse]][:1]:
-        raise ValueError(f"{table.location(row, name)}: the known input has another value at the same time above.")
+    if (other_rows := rows[values[rows] != first_values[inverse]]).size:
+        raise ValueError(f"{table.location(other_rows[0], name)}: the known input has another value at the same time.")
     return InputTable(unique_times, first_values, "previous" if interpolation == "zero" else interpolation)
 
 

@@ -92,7 +92,8 @@ class Data:
             raise ValueError(f"y must have shape (times, outputs) = ({len(times)}, {len(self.outputs)}), got {y.shape} "
                              f"for times of shape {times.shape} and outputs {self.outputs}.")
         checks.finite("times", times)
-        for index in np.flatnonzero(np.diff(times) < 0)[:1] + 1:
+        if (times[1:] < times[:-1]).any():
+            index = int(np.argmax(times[1:] < times[:-1])) + 1
             raise ValueError(f"times must not go back, got {times[index]:g} after {times[index - 1]:g} at index "
                              f"{index}. Sort the observations by time.")
 

@@ -31,7 +31,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType, ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 from lfm_ppl.io.data_set import INTERPOLATIONS, Data
 from lfm_ppl.utils import checks
@@ -239,7 +239,8 @@ def _check_signature(path: Path, definitions: Mapping[str, Any], name: str, *arg
         raise ValueError(f"{path}: {name} must take {_ARGUMENTS[name]}: {error}.") from None
 
 
-class SourceLocation(NamedTuple):
+@dataclass(frozen=True)
+class SourceLocation:
     """A line of a model file, and whether the file comes with the library."""
 
     file: str

@@ -29,18 +29,19 @@ def _codes(column: np.ndarray) -> list[float]:
     """Return the numbers in a column (T,) that look like codes and are far from all other numbers.
 
     1. Candidates are the smallest and largest numbers, as long as they look like codes.
-    2. A candidate that is not far from the rest joins the rest; this repeats until all candidates are far.
+    2. Candidates that are not far from the usual values become usual, until all candidates are far.
     """
     values = np.unique(column[np.isfinite(column)])
     is_code = np.array([_looks_like_code(value) for value in values], bool)
     is_candidate = np.logical_and.accumulate(is_code) | np.logical_and.accumulate(is_code[::-1])[::-1]
     with np.errstate(over="ignore"):  # differences of the largest numbers
         while is_candidate.any() and not is_candidate.all():
-            rest = values[~is_candidate]
-            distance, gap = np.maximum(rest[0] - values, values - rest[-1]), np.diff(rest).max(initial=0.0)
-            is_far = (distance > _FAR_RANGES * np.ptp(rest)) | (distance > np.maximum(np.ptp(rest), _FAR_GAPS * gap))
+            usual = values[~is_candidate]
+            value_range, gap = np.ptp(usual), np.diff(usual).max(initial=0.0)
+            distance = np.maximum(usual[0] - values, values - usual[-1])
+            is_far = (distance > _FAR_RANGES * value_range) | (distance > max(value_range, _FAR_GAPS * gap))
             # -999 among flows of 0 to 5,000 is less than their range away from them, but negative.
-            is_far |= (values <= -99) & (rest[0] >= 0) & (distance > gap)
+            is_far |= (values <= -99) & (usual[0] >= 0) & (distance > gap)
             if is_far[is_candidate].all():
                 return values[is_candidate].tolist()
             is_candidate &= is_far

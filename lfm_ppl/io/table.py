@@ -41,7 +41,8 @@ class Table:
     def numbers(self, column: str, requirement: str = _NUMBER) -> np.ndarray:
         """Return the numbers (T,) of a column, NaN where they are missing; ValueError for a cell without a number."""
         values = np.array([_number(cell) for cell in self.frame[column]])
-        for row in np.flatnonzero(np.isinf(values))[:1]:
+        if np.isinf(values).any():
+            row = int(np.argmax(np.isinf(values)))
             cell = self.frame[column].iloc[row]
             text = repr(cell) if len(repr(cell)) <= 60 else f"{repr(cell)[:50]}... ({len(repr(cell))} characters)"
             raise ValueError(f"{self.location(row, column)}: {requirement.format(text)}{_remedy(str(cell))}")

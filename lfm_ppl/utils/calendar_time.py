@@ -17,7 +17,7 @@ _SPELLINGS = {"ms": (1e-3, ""), "s": (1.0, "sec second seconds"), "min": (60.0, 
               "h": (3600.0, "hr hour hours"), "d": (86400.0, "day days"), "weeks": (604800.0, "week"),
               "years": (31557600.0, "yr year")}  # a year has 365.25 days
 USUAL = tuple(_SPELLINGS)  # the spellings that the library prints
-UNITS = {spelling: unit for unit, (_, others) in _SPELLINGS.items() for spelling in (unit, *others.split())}
+UNITS = {spelling: unit for unit, (_, more) in _SPELLINGS.items() for spelling in (unit, *more.split())}
 SECONDS = {spelling: _SPELLINGS[unit][0] for spelling, unit in UNITS.items()}
 _SMALLEST_GAPS = {"years": 300 * 86400.0, "d": 86400.0, "h": 3600.0, "min": 60.0, "s": 0.0}  # in seconds
 _ISO_DATE = re.compile(r"\s*(?=.*[-:])\d{4}-?\d\d-?\d\d([\sT][\d:.]*)?\s*(?P<offset>Z|[+-]\d\d:?(\d\d)?)?\s*")
@@ -66,7 +66,8 @@ def _read(name: str, values: Any, location: Callable[[int], str] | None = None) 
                            for cell, match in zip(cells.flat, matches, strict=True)])
     utc = pd.to_datetime(pd.Series(dates, dtype=object), format="ISO8601", errors="coerce", utc=True)
     index = pd.DatetimeIndex(utc).as_unit("us")
-    for row in np.flatnonzero(index.isna() | (has_offset != has_offset[0]))[:1]:
+    if (rows := np.flatnonzero(index.isna() | (has_offset != has_offset[0]))).size:
+        row = rows[0]
         label = location(row) if location else f"{name}[{row}]" if cells.ndim else name
         offset = "with" if has_offset[0] else "without"
         raise ValueError(f"{label}: expected a date, year first, such as 2026-03-31T18:00, {offset} an offset from UTC "
