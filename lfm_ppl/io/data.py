@@ -211,7 +211,8 @@ def _times(table: Table, name: str, unit: str | None, usual: str | None,
                     f"{cells[row]}")
         if (series := _series_column(table, times, free)) is not None:
             labels = table.frame[series].iloc[row - 1:row + 1]
-            raise ValueError(f"{location}, where the column {series!r} changes from {' to '.join(map(str, labels))}. If "
+            change = " to ".join(map(str, labels))
+            raise ValueError(f"{location}, where the column {series!r} changes from {change}. If "
                              f"it names several series, fit them separately: --series {series} (lfm.data.read_series("
                              f"path, {series!r}), or lfm.read_table of each part of a DataFrame).")
         raise ValueError(f"{location}. Sort the rows by time; replicates are rows with the same time. A clock that is "

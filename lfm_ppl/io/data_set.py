@@ -88,8 +88,8 @@ class Data:
         for name, value in {"times": times, "y": y, "outputs": tuple(self.outputs), "units": units, "inputs": inputs,
                             "origin": origin}.items():
             object.__setattr__(self, name, value)
-        if times.ndim != 1 or y.shape != (len(times), len(self.outputs)):
-            raise ValueError(f"y must have shape (times, outputs) = ({len(times)}, {len(self.outputs)}), got {y.shape} "
+        if times.ndim != 1 or y.shape != (times.size, len(self.outputs)):
+            raise ValueError(f"y must have shape (times, outputs) = ({times.size}, {len(self.outputs)}), got {y.shape} "
                              f"for times of shape {times.shape} and outputs {self.outputs}.")
         checks.finite("times", times)
         if (times[1:] < times[:-1]).any():
