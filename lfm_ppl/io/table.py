@@ -119,7 +119,7 @@ def from_frame(value: Any) -> Table:
             raise ValueError(f"{label} has columns of {' and '.join(map(str, lengths))} rows; expected equal numbers.")
         return _checked(label, pd.DataFrame(columns, dtype=object))
     if library == "xarray":
-        value = value.to_dataframe(*[value.name or "y"][:hasattr(value, "name")])
+        value = (value if hasattr(value, "data_vars") else value.to_dataset(name=value.name or "y")).to_dataframe()
         if value.index.nlevels > 1:
             raise ValueError(f"the Dataset has the dimensions {', '.join(map(str, value.index.names))}; expected the "
                              "time alone. Give each series a variable of its own: array.to_dataset(dim=...).")

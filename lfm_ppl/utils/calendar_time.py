@@ -58,6 +58,7 @@ def _read(name: str, values: Any, location: Callable[[int], str] | None = None) 
     import pandas as pd
 
     cells = np.asarray(np.ma.filled(values, np.datetime64("NaT")))
+    cells = cells.astype(object) if cells.dtype.kind == "U" else cells  # pandas 2 reads no text of NumPy
     matches = [_ISO_DATE.fullmatch(cell) if isinstance(cell, str) else None for cell in cells.flat]
     # pandas also reads "now", and numbers as nanoseconds.
     dates = [match[0].strip() if match else cell if is_date(cell) else None
