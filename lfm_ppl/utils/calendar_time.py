@@ -57,7 +57,7 @@ def _read(name: str, values: Any, location: Callable[[int], str] | None = None) 
     """Return the cells and their dates, a DatetimeIndex in UTC where they have offsets, else without a time zone."""
     import pandas as pd
 
-    cells = np.asarray(np.ma.filled(values, np.datetime64("NaT")))
+    cells = np.asarray(np.ma.filled(values, np.datetime64("NaT", "s")))
     cells = cells.astype(object) if cells.dtype.kind == "U" else cells  # pandas 2 reads no text of NumPy
     matches = [_ISO_DATE.fullmatch(cell) if isinstance(cell, str) else None for cell in cells.flat]
     # pandas also reads "now", and numbers as nanoseconds.
@@ -147,4 +147,5 @@ def named(time: float) -> str:
 def days_of(times: Any, origin: str, unit: str) -> np.ndarray:
     """Return times as days since 1970-01-01, on the clock of the origin: Matplotlib's dates."""
     midnight = np.datetime64(datetime.fromisoformat(origin).replace(tzinfo=None))
-    return (midnight - np.datetime64(0, "D")) / np.timedelta64(1, "D") + np.asarray(times) * (SECONDS[unit] / 86400.0)
+    days = (midnight - np.datetime64("1970-01-01")) / np.timedelta64(1, "D")
+    return days + np.asarray(times) * (SECONDS[unit] / SECONDS["d"])
