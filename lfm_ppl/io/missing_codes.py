@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import takewhile
 
 import numpy as np
 
@@ -32,8 +33,8 @@ def _codes(column: np.ndarray) -> list[float]:
     2. Candidates that are not far from the usual values become usual, until all candidates are far.
     """
     values = np.unique(column[np.isfinite(column)])
-    is_code = np.array([_looks_like_code(value) for value in values], bool)
-    is_candidate = np.logical_and.accumulate(is_code) | np.logical_and.accumulate(is_code[::-1])[::-1]
+    low, high = (sum(1 for _ in takewhile(_looks_like_code, side)) for side in (values, values[::-1]))
+    is_candidate = (np.arange(len(values)) < low) | (np.arange(len(values))[::-1] < high)
     with np.errstate(over="ignore"):  # differences of the largest numbers
         while is_candidate.any() and not is_candidate.all():
             usual = values[~is_candidate]
