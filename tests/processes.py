@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -20,3 +21,24 @@ def on_two_devices(code: str) -> subprocess.CompletedProcess:
     }
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=environment,
                           timeout=300)
+
+
+def start_python(*arguments: str, **options) -> subprocess.Popen:
+    """Start Python in a session of its own; options as of `Popen`."""
+    return subprocess.Popen([sys.executable, *arguments], cwd=ROOT, start_new_session=True, text=True, **options)
+
+
+def is_running(pid: int) -> bool:
+    """Return whether a process runs; an ended process that nobody has waited for does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait_until(condition, seconds: float = 120.0) -> None:
+    """Wait until a condition holds; fail after some seconds."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)

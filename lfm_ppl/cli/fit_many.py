@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Fit every data set without a stored result; return 1 if some failed."""
     from lfm_ppl import fit_many
     from lfm_ppl.results import tables
-    from lfm_ppl.utils.progress import Console, duration
+    from lfm_ppl.utils.progress import duration
 
     workers = choices.workers(arguments.jobs, arguments.scheduler)
     session.start(1, not arguments.no_cache, one_thread=True)
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
             each=options_by_name,
             seed=arguments.seed,
             overwrite=arguments.overwrite,
-            report=None if arguments.quiet else Console(),
+            progress=not arguments.quiet,
             **sampling_arguments(arguments, model),
         )
         fits.refused = failed

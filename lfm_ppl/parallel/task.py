@@ -5,16 +5,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import string
-from collections.abc import Iterable, Mapping
+import re
+import time
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
+import numpy as np
 
 Result = dict[str, Any]
 """Name -> number, text or small array."""
-
-_ALLOWED = frozenset(string.ascii_letters + string.digits + "/-_.()")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,8 +39,7 @@ class Task:
     data: Any = dataclasses.field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check the name and that the settings can be stored."""
-        if not self.name or set(self.name) - _ALLOWED:
+        if not re.fullmatch(r"[A-Za-z0-9/_.()-]+", self.name):
             raise ValueError(f"the name of a task may have letters, digits and / - _ . ( ), got {self.name!r}.")
         try:
             json.dumps(dict(self.settings), allow_nan=False)
@@ -63,18 +62,17 @@ class Task:
         return json.loads(json.dumps({"name": self.name, "seed": self.seed, "settings": dict(self.settings)}))
 
 
-def check_distinct(tasks: Iterable[Task]) -> None:
-    """Raise ValueError if two tasks share a name or a file.
+Compute = Callable[[Task], Mapping[str, Any]]
+TimedArrays = tuple[dict[str, np.ndarray], float]
+Computed = tuple[Task, TimedArrays | Exception, int]
 
-    Example:
-        >>> check_distinct([Task("a/b", 0), Task("a-b", 0)])
-        Traceback (most recent call last):
-            ...
-        ValueError: the tasks 'a/b' and 'a-b' share the file a-b.npz; use unique names.
-    """
-    seen: dict[str, str] = {}
-    for task in tasks:
-        if task.stem in seen:
-            raise ValueError(f"the tasks {seen[task.stem]!r} and {task.name!r} share the file {task.stem}.npz; use "
-                             "unique names.")
-        seen[task.stem] = task.name
+
+def compute_task(compute: Compute, task: Task) -> TimedArrays:
+    """Return the result of a task as arrays, and the seconds that it took."""
+    start_time = time.perf_counter()
+    arrays = {name: np.asarray(value) for name, value in compute(task).items()}
+    for name, array in arrays.items():
+        if array.dtype.kind not in "biufU":
+            raise TypeError(f"entry {name!r} of the result must be a number, an array of numbers or text, got "
+                            f"{type(array.ravel()[0]).__name__}.")
+    return arrays, time.perf_counter() - start_time

@@ -3,12 +3,13 @@
 1. A `Console` shows a bar of tqdm on a terminal or in a notebook. Elsewhere it gets a line every 30 s.
 2. While a program compiles, which cannot report its progress, the line is repeated with the time so far.
 3. The time left is extrapolated from the pace of the last minute, since the steps of a warm-up may cost much more or
-   less than later ones.
+   less than later ones. For tasks on several workers it follows from the median duration of the tasks that have ended.
 """
 
 from __future__ import annotations
 
 import contextlib
+import statistics
 import sys
 import threading
 import time
@@ -73,8 +74,9 @@ class Progress:
         if isinstance(report, Console) and report.is_terminal and done < total:
             from tqdm.auto import tqdm
 
-            self._bar = tqdm(total=total, initial=done, desc=label, unit=f" {unit}", file=report.file or sys.stderr,
-                             dynamic_ncols=True)
+            # Without the time left of tqdm, which follows the last steps alone.
+            self._bar = tqdm(total=total, initial=done, desc=label, file=report.file or sys.stderr, dynamic_ncols=True,
+                             bar_format="{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]")
 
     def __enter__(self) -> Progress:
         return self
@@ -88,8 +90,6 @@ class Progress:
     def start(self) -> None:
         """Measure the pace from now."""
         self._records.append((time.perf_counter(), self._done))
-        if self._bar is not None:
-            self._bar.unpause()
 
     def compile(self, text: str) -> None:
         """Show that a program is being compiled, until the next call of `advance`."""
@@ -112,14 +112,16 @@ class Progress:
         self._records.append((time.perf_counter(), done))
         while len(self._records) > 2 and self._records[1][0] <= self._records[-1][0] - _PACE_S:
             self._records.popleft()
+        seconds = self.seconds_left()
+        if seconds:
+            qualifier = " at most" if self._includes_compilation and len(self._records) > 1 else qualifier
+            text += f"; about {duration(seconds)} left{qualifier}"
         if self._bar is not None:
-            self._bar.set_postfix_str(text, refresh=False)
+            self._bar.set_postfix_str(text.removeprefix("; "), refresh=False)
             self._bar.update(done - self._done)
         elif self._report is not None and (self._is_due() or done == self._total):
-            if self._includes_compilation and len(self._records) > 1:
-                qualifier = " at most"
-            self._report(f"{self._label}: {done:,} of {self._total:,} {self._unit}" + (f", {text}" if text else "")
-                         + self._time_left(qualifier))
+            separator = ", " if text and not text.startswith(";") else ""
+            self._report(f"{self._label}: {done:,} of {self._total:,} {self._unit}{separator}{text}")
         if self._includes_compilation:
             self._includes_compilation = False
             self._records = deque([self._records[-1]])
@@ -139,16 +141,43 @@ class Progress:
         (first_time, first_done), (last_time, last_done) = self._records[0], self._records[-1]
         return (last_time - first_time) / (last_done - first_done) * (self._total - last_done)
 
-    def _time_left(self, qualifier: str) -> str:
-        seconds = self.seconds_left()
-        return f"; about {duration(seconds)} left{qualifier}" if seconds else ""
-
     def _is_due(self) -> bool:
         clock_time = time.perf_counter()
         if clock_time - self._last_line < EVERY_S:
             return False
         self._last_line = clock_time
         return True
+
+
+class TaskProgress(Progress):
+    """Display of tasks that several workers compute.
+
+    The time left follows from the median duration of the tasks that have ended. The first tasks compile and take
+    longer: the median forgets them, where a mean would jump.
+    """
+
+    def __init__(self, report: Reporter | None, total: int, done: int) -> None:
+        super().__init__(report, total, "tasks", "computed", done)
+        self._durations: list[float] = []
+        self._workers = 1
+
+    def end_task(self, name: str, seconds: float | None, workers: int) -> None:
+        """Count a task that has ended.
+
+        Args:
+            name: name of the task.
+            seconds: its duration; None after a failure.
+            workers: number of workers.
+        """
+        self._durations += [] if seconds is None else [seconds]
+        self._workers = workers
+        self.advance(self._done + 1, name)
+
+    def seconds_left(self) -> float | None:
+        """Return the seconds left; None until as many tasks as workers have ended."""
+        if len(self._durations) < self._workers:
+            return None
+        return statistics.median_low(self._durations) * (self._total - self._records[-1][1]) / self._workers
 
 
 class _RepeatedLine:

@@ -11,6 +11,7 @@ Chains (`lfm_ppl.results.checkpoint`), batches of draws and tasks (`lfm_ppl.para
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import socket
@@ -26,6 +27,9 @@ from lfm_ppl.utils.atomic_files import atomic_write
 from lfm_ppl.utils.errors import FolderInUseError
 
 _LOCK, _OWNER = ".lock", ".held-by"
+
+_RECORD = "__task__"
+"""Entry of a file that holds the settings of the arrays."""
 
 
 class DamagedFileError(ValueError):
@@ -101,27 +105,44 @@ class RunStore:
         """Return whether a name is stored."""
         return self.path(name).is_file()
 
-    def get(self, name: str) -> dict[str, np.ndarray] | None:
+    def get(self, name: str, record: Mapping[str, Any] | None = None,
+            overwrite: bool = False) -> dict[str, np.ndarray] | None:
         """Return the arrays of a name; None if it is not stored.
+
+        Args:
+            name: the name.
+            record: settings with which the arrays must have been stored.
+            overwrite: return None for other settings, which are an error otherwise.
 
         Raises:
             DamagedFileError: the file cannot be read.
+            ValueError: the arrays were stored with other settings.
         """
         path = self.path(name)
         if not path.is_file():
             return None
         try:
             with np.load(path) as file:
-                return {key: file[key] for key in file.files}
+                arrays = {key: file[key] for key in file.files}
+            stored = record if record is None else json.loads(str(arrays.pop(_RECORD)))
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise DamagedFileError(f"{path} is damaged ({type(error).__name__}: {error}). Start the run anew with "
                                    "overwrite=True (--overwrite), or in another folder.") from error
+        if stored == record:
+            return arrays
+        if overwrite:
+            return None
+        old, new = ({**settings, **settings.get("settings", {}), "settings": None} for settings in (stored, record))
+        differences = [f"{key} is {old.get(key)!r} there and {new.get(key)!r} now"
+                       for key in {**old, **new} if old.get(key) != new.get(key)]
+        raise ValueError(f"{path} holds a result with other settings: {', '.join(differences[:3])}. Choose another "
+                         "folder, or replace it with overwrite=True (--overwrite on the command line).")
 
-    def put(self, name: str, arrays: Mapping[str, Any]) -> Path:
-        """Store the arrays of a name, atomically, and return the file."""
-        path = self.path(name)
+    def put(self, name: str, arrays: Mapping[str, Any], record: Mapping[str, Any] | None = None) -> Path:
+        """Store the arrays of a name with the settings of `get`, atomically, and return the file."""
+        path, entries = self.path(name), {} if record is None else {_RECORD: json.dumps(record)}
         with atomic_write(path, overwrite=True) as temporary, temporary.open("wb") as file:
-            np.savez(file, **dict[str, Any](arrays))
+            np.savez(file, **{**entries, **arrays})
         return path
 
     def clear(self) -> None:

@@ -1,10 +1,9 @@
 """Fits of one NumPyro model to many data sets: one after another or in several processes, and resumable.
 
-1. Each data set becomes a task. Its settings hold digests of the data and the model, and the options of `lfm_ppl.fit`.
-2. The engine runs the tasks that have no stored result. The seed of a fit depends on the seed of the run and on the
-   name of the data set only.
-3. Each result is stored as arrays (`lfm_ppl.results.packing`).
-4. At the end a table, the draws of all data sets and the list of failures are written.
+1. Each data set becomes a task, whose settings are digests of data and model, and the options of `lfm_ppl.fit`. The
+   seed of a fit depends on the seed of the run and on the name of the data set only.
+2. `lfm_ppl.parallel` computes the tasks without a stored result, and stores each one (`lfm_ppl.results.packing`).
+3. At the end a table, the draws of all data sets and the list of failures are written.
 """
 
 from __future__ import annotations
@@ -21,16 +20,21 @@ import xarray as xr
 
 from lfm_ppl.parallel.cluster import Workers, check_workers
 from lfm_ppl.parallel.run import outcomes
-from lfm_ppl.parallel.task import Task, check_distinct
+from lfm_ppl.parallel.task import Task
 from lfm_ppl.results import arviz_data, tables
 from lfm_ppl.results.packing import unpack_result
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.progress import Reporter
+from lfm_ppl.utils.progress import Console, Reporter
 from lfm_ppl.workflows.fit import fit
 from lfm_ppl.workflows.fit_tasks import FitDataSet, fit_task
 
 FITS, SUMMARY, POSTERIORS, FAILED = "fits", "summary.csv", "posteriors.nc", "failed.csv"
 """Contents of a folder of results: one file for each data set, and over all of them a table, draws and failures."""
+
+_GROUPS = "posterior", "sample_stats", "truth"
+_SHARED_ATTRIBUTES = ("model", "rule", "steps", "max_step", "iterations", "tolerance", "sampler", "chains", "warmup",
+                      "samples", "thin", "versions")
+"""Groups and attributes of the object of all data sets."""
 
 _NOT_SHARED = ("numpyro_model", "times", "y", "seed", "progress", "truth", "name", "checkpoint", "resume", "overwrite")
 """Arguments of `fit` that differ between data sets, or that `fit_many` does not have."""
@@ -66,11 +70,11 @@ class ManyFits:
             failed.
     """
 
-    def __init__(self, model: Callable, tasks: Mapping[str, Task], out: Path | None, engine: Mapping[str, Any]) -> None:
+    def __init__(self, model: Callable, tasks: Mapping[str, Task], out: Path | None, **task_options: Any) -> None:
         self.names = tuple(tasks)
         self.failed: dict[str, str] = {}
         self.refused: dict[str, str] = {}
-        self._model, self._tasks, self._out, self._engine = model, dict(tasks), out, dict(engine)
+        self._model, self._tasks, self._out, self._task_options = model, tasks, out, task_options
         self._tables: dict[str, pd.DataFrame] = {}
         self._draws: dict[str, dict[str, xr.Dataset]] = {}
         self._attrs: dict[str, Any] = {}
@@ -85,16 +89,15 @@ class ManyFits:
         for name, reason in self.refused.items():
             yield Fitted(name, None, ValueError(reason))
         names = {task.name: name for name, task in self._tasks.items()}
-        folder = self._out and self._out / FITS
-        for outcome in outcomes(self._tasks.values(), FitDataSet(self._model), folder, alike=True, **self._engine):
-            name = names[outcome.task.name]
+        folder = None if self._out is None else self._out / FITS
+        for outcome in outcomes(self._tasks.values(), FitDataSet(self._model), folder, **self._task_options):
+            name, result = names[outcome.task.name], None
             if outcome.result is None:
                 self.failed[name] = outcome.reason
-                yield Fitted(name, None, outcome.error)
             else:
                 result = unpack_result(outcome.result)
                 self._add(name, result)
-                yield Fitted(name, result, stored=outcome.stored)
+            yield Fitted(name, result, outcome.error, outcome.stored)
         if self._out is not None:
             self._write(self._out)
 
@@ -107,7 +110,7 @@ class ManyFits:
     def _add(self, name: str, result: Any) -> None:
         self._tables[name] = arviz_data.summary(result)
         self._attrs = arviz_data.attributes(result)
-        self._draws[name] = {group: arviz_data.group(result, group) for group in ("posterior", "sample_stats", "truth")
+        self._draws[name] = {group: arviz_data.group(result, group) for group in _GROUPS
                              if arviz_data.has_group(result, group)}
 
     @property
@@ -144,21 +147,18 @@ class ManyFits:
         Raises:
             ValueError: no data set has a posterior.
         """
-        fitted = [name for name in self.names if name in self._draws]
-        if not fitted:
+        if not self._draws:
             raise ValueError("there is no posterior: no data set was fitted yet, or all of them failed.")
         joined = {}
-        for group in dict.fromkeys(group for name in fitted for group in self._draws[name]):
-            names = [name for name in fitted if group in self._draws[name]]
-            index = xr.DataArray(np.array(names, str), dims="data_set", name="data_set")
-            dataset = xr.concat([self._draws[name][group] for name in names], index, join="outer", data_vars="all",
-                                coords="minimal", compat="override")
-            leading = [name for name in ("chain", "draw") if name in dataset.dims]
-            joined[group] = dataset.transpose(*leading, "data_set", ...)
-        shared = {name: value for name, value in self._attrs.items() if name in (
-            "model", "rule", "steps", "max_step", "iterations", "tolerance", "sampler", "chains", "warmup", "samples",
-            "thin", "versions")}
-        return arviz_data.build(joined, {**shared, "data_sets": len(fitted)})
+        for group in _GROUPS:
+            datasets = {name: self._draws[name][group] for name in self.names if group in self._draws.get(name, ())}
+            if datasets:
+                index = xr.DataArray(np.array(list(datasets), str), dims="data_set", name="data_set")
+                dataset = xr.concat(list(datasets.values()), index, join="outer", data_vars="all", coords="minimal",
+                                    compat="override")
+                joined[group] = dataset.transpose("chain", "draw", "data_set", ..., missing_dims="ignore")
+        shared = {name: value for name, value in self._attrs.items() if name in _SHARED_ATTRIBUTES}
+        return arviz_data.build(joined, {**shared, "data_sets": len(self._draws)})
 
     def _write(self, out: Path) -> None:
         """Write the table, the draws and the failures of all data sets."""
@@ -181,15 +181,15 @@ def fit_many(
     seed: int = 0,
     each: Mapping[str, Mapping[str, Any]] | None = None,
     overwrite: bool = False,
+    progress: bool = True,
     report: Reporter | None = None,
     **options: Any,
 ) -> ManyFits:
     """Fit a latent force model to each of many data sets.
 
-    Data sets with equal times and shapes share the compiled programs of `fit` in each process, and processes share
-    compiled programs: on one machine the first data set is fitted alone, or at least starts a minute before the others.
-    The result of a data set is that of `fit` with the seed ``seed_of(name, seed)``, for any other data sets and any
-    number of workers.
+    Data sets with equal times and shapes share the compiled programs of `fit` in each process, and the processes of one
+    machine share a cache of compiled programs. The result of a data set is that of `fit` with the seed
+    ``seed_of(name, seed)``, for any other data sets and any number of workers.
 
     Args:
         numpyro_model: the model, as in `fit`.
@@ -202,7 +202,8 @@ def fit_many(
         each: name of a data set -> arguments of `fit` for this data set, as in ``{"patient-7": {"fixed": ...}}``; also
             ``truth`` and ``name``.
         overwrite: fit again where the folder has a result of other data, another model or other options.
-        report: function of a line of progress, such as ``print``; None: no report.
+        progress: show the number of fitted data sets and the time left on standard error, as in `fit`.
+        report: function that gets each line of progress instead, such as ``print``.
         **options: further arguments of `fit`, such as ``sampler="map"``.
 
     Returns:
@@ -222,7 +223,7 @@ def fit_many(
         ...     numpyro.sample("y", lfm.MarginalLikelihood(lfmodel, times), obs=y)
         >>> times = np.arange(5.0)
         >>> data_sets = {f"plant-{k}": (times, np.sin(times + k)[:, None]) for k in range(3)}
-        >>> fits = lfm.fit_many(model, data_sets, sampler="map", samples=50, trajectory_draws=0)
+        >>> fits = lfm.fit_many(model, data_sets, sampler="map", samples=50, trajectory_draws=0, progress=False)
         >>> for fitted in fits:
         ...     print(fitted.name, fitted.result["posterior"]["rate"].shape)
         plant-0 (1, 50)
@@ -253,9 +254,8 @@ def fit_many(
         if name in tasks:
             raise ValueError(f"two data sets are called {name!r}; give every one a name of its own.")
         tasks[name] = fit_task(numpyro_model, name, value, {**options, **each.get(name, {})}, seed, digests)
-    check_distinct(tasks.values())
-    return ManyFits(numpyro_model, tasks, None if out is None else Path(out),
-                    {"workers": workers, "overwrite": overwrite, "report": report})
+    return ManyFits(numpyro_model, tasks, None if out is None else Path(out), workers=workers, overwrite=overwrite,
+                    report=(report or Console()) if progress else None)
 
 
 def _check_options(label: str, options: Mapping[str, Any], accepted: list[str]) -> None:

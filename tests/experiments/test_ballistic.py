@@ -18,7 +18,6 @@ from lfm_ppl.experiments.ballistic.problem import (
 )
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.io import loading
-from lfm_ppl.parallel.store import write_result
 from lfm_ppl.utils.run_store import RunStore
 
 SMALL = experiment.BallisticSettings(
@@ -203,7 +202,7 @@ def test_constant_chain_is_reported():
 def test_stored_results_are_tabulated_without_computing(tmp_path):
     results = synthetic_results(SYNTHETIC)
     for task in experiment.all_tasks(SYNTHETIC):
-        write_result(task, results[task.name], RunStore(tmp_path / TASKS))
+        RunStore(tmp_path / TASKS).put(task.stem, results[task.name], task.record())
     lines = []
     study_result = experiment.STUDY.run(SYNTHETIC, tmp_path, report=lines.append)
     count = len(results)

@@ -14,7 +14,6 @@ from scipy import integrate, stats
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.call_centre import counts, experiment, figures, problem, tracking
 from lfm_ppl.experiments.study import TASKS
-from lfm_ppl.parallel.store import write_result
 from lfm_ppl.utils.run_store import RunStore
 
 DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
@@ -233,7 +232,7 @@ def test_figures():
 def test_stored_results_are_tabulated_without_computing(tmp_path):
     results = synthetic_results(SYNTHETIC)
     for task in experiment.all_tasks(SYNTHETIC):
-        write_result(task, results[task.name], RunStore(tmp_path / TASKS))
+        RunStore(tmp_path / TASKS).put(task.stem, results[task.name], task.record())
     lines = []
     with pytest.warns(counts.OverloadWarning, match="changed service rate: on 3 of 3 test days"):
         study_result = experiment.STUDY.run(SYNTHETIC, tmp_path, report=lines.append)

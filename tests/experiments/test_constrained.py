@@ -15,7 +15,6 @@ from lfm_ppl.experiments import catalogue
 from lfm_ppl.experiments.constrained import estimators, experiment, figures, problem
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.inference.optimise import Objective
-from lfm_ppl.parallel.store import write_result
 from lfm_ppl.utils.run_store import RunStore
 
 
@@ -164,7 +163,7 @@ def store_results(folder, settings):
                       "k": np.where(np.arange(count) == 0, np.inf, 0.2),
                       "converged": np.ones(count, bool), "bands_converged": np.ones(count, bool),
                       "y": random.normal(size=(25, 3)), "measured": hours}
-        write_result(task, result, RunStore(Path(folder) / TASKS))
+        RunStore(Path(folder) / TASKS).put(task.stem, result, task.record())
 
 
 def test_tables_and_figures_from_stored_results(tmp_path):

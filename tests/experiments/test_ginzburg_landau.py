@@ -7,7 +7,6 @@ from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.ginzburg_landau import experiment, figures, parameters, problem, states
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.experiments.tasks import slug
-from lfm_ppl.parallel.store import write_result
 from lfm_ppl.utils.run_store import RunStore
 
 SMALL = experiment.GinzburgLandauSettings(
@@ -176,7 +175,7 @@ def test_the_figures_are_drawn_and_labelled():
 def test_stored_results_are_tabulated_without_computing(tmp_path):
     results = synthetic_results(SYNTHETIC)
     for study_task in experiment.all_tasks(SYNTHETIC):
-        write_result(study_task, results[study_task.name], RunStore(tmp_path / TASKS))
+        RunStore(tmp_path / TASKS).put(study_task.stem, results[study_task.name], study_task.record())
     lines = []
     result = experiment.STUDY.run(SYNTHETIC, tmp_path, report=lines.append)
     count = len(experiment.all_tasks(SYNTHETIC))

@@ -16,7 +16,6 @@ from lfm_ppl.experiments.published import PublishedComparison
 from lfm_ppl.experiments.study import TASKS
 from lfm_ppl.experiments.transcription import experiment, figures, problem, slices
 from lfm_ppl.latent_grid.laplace import laplace
-from lfm_ppl.parallel.store import write_result
 from lfm_ppl.parallel.task import Task
 from lfm_ppl.utils.run_store import RunStore
 
@@ -297,7 +296,7 @@ def test_infinite_errors_count_as_divergence():
 def test_stored_results_are_tabulated_without_computing(tmp_path):
     results = synthetic_results(FEW)
     for task in experiment.all_tasks(FEW):
-        write_result(task, results[task.name], RunStore(tmp_path / TASKS))
+        RunStore(tmp_path / TASKS).put(task.stem, results[task.name], task.record())
     study_result = experiment.STUDY.run(FEW, tmp_path)
     written = experiment.STUDY.save(study_result, tmp_path)
     assert {path.name for path in written} == {
@@ -315,7 +314,7 @@ def test_notes_count_consistent_cells(tmp_path):
     results = synthetic_results(settings)
     for task in experiment.all_tasks(settings):
         results[task.name]["rmse"] = results[task.name]["rmse"] + [0.0, 1e-3]
-        write_result(task, results[task.name], RunStore(tmp_path / TASKS))
+        RunStore(tmp_path / TASKS).put(task.stem, results[task.name], task.record())
     study_result = experiment.STUDY.run(settings, tmp_path)
     experiment.STUDY.save(study_result, tmp_path)
     assert study_result.notes == (  # LA has one sound data set alone, ESLS 0.3005 (0.0005) for 0.290, GFS 0.6 for 0.358
