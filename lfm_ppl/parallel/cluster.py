@@ -121,7 +121,7 @@ def compute_on_workers(cluster: Cluster, tasks: list[Task], compute: Compute) ->
     environment = compilation.ONE_THREAD | {name: os.environ.get(name, text) for name, text in defaults.items()}
     jax_config = {"jax_enable_x64": jax.config.read("jax_enable_x64"), **cluster.jax_config}
     client, program, settings = cluster.client, cloudpickle.dumps(compute), (_versions(), environment, jax_config)
-    waiting, futures, ended = iter(tasks), dict[Any, Task](), as_completed()
+    waiting, futures, ended = iter(tasks), dict[Any, Task](), as_completed(loop=client.loop)
 
     def submit() -> int:
         worker_count = max(len(client.nthreads()), 1)

@@ -28,9 +28,6 @@ from lfm_ppl.utils.progress import Console, Reporter
 from lfm_ppl.workflows.fit import fit
 from lfm_ppl.workflows.fit_tasks import FitDataSet, fit_task
 
-FITS, SUMMARY, POSTERIORS, FAILED = "fits", "summary.csv", "posteriors.nc", "failed.csv"
-"""Contents of a folder of results: one file for each data set, and over all of them a table, draws and failures."""
-
 _GROUPS = "posterior", "sample_stats", "truth"
 _SHARED_ATTRIBUTES = ("model", "rule", "steps", "max_step", "iterations", "tolerance", "sampler", "chains", "warmup",
                       "samples", "thin", "versions")
@@ -44,11 +41,8 @@ _NOT_SHARED = ("numpyro_model", "times", "y", "seed", "progress", "truth", "name
 class Fitted:
     """The fit of one data set.
 
-    Attributes:
-        name: name of the data set.
-        result: the ArviZ object that `fit` returns; None where it failed.
-        error: the error of a failed fit.
-        stored: whether the result was stored before this run.
+    ``result`` is the ArviZ object that `fit` returns, or None after an ``error``; ``stored`` says whether it was stored
+    before this run.
     """
 
     name: str
@@ -89,14 +83,16 @@ class ManyFits:
         for name, reason in self.refused.items():
             yield Fitted(name, None, ValueError(reason))
         names = {task.name: name for name, task in self._tasks.items()}
-        folder = None if self._out is None else self._out / FITS
+        folder = None if self._out is None else self._out / "fits"
         for outcome in outcomes(self._tasks.values(), FitDataSet(self._model), folder, **self._task_options):
             name, result = names[outcome.task.name], None
             if outcome.result is None:
                 self.failed[name] = outcome.reason
             else:
                 result = unpack_result(outcome.result)
-                self._add(name, result)
+                self._tables[name], self._attrs = arviz_data.summary(result), arviz_data.attributes(result)
+                self._draws[name] = {group: arviz_data.group(result, group) for group in _GROUPS
+                                     if arviz_data.has_group(result, group)}
             yield Fitted(name, result, outcome.error, outcome.stored)
         if self._out is not None:
             self._write(self._out)
@@ -106,12 +102,6 @@ class ManyFits:
         for _ in self:
             pass
         return self
-
-    def _add(self, name: str, result: Any) -> None:
-        self._tables[name] = arviz_data.summary(result)
-        self._attrs = arviz_data.attributes(result)
-        self._draws[name] = {group: arviz_data.group(result, group) for group in _GROUPS
-                             if arviz_data.has_group(result, group)}
 
     @property
     def summary(self) -> pd.DataFrame:
@@ -163,13 +153,13 @@ class ManyFits:
     def _write(self, out: Path) -> None:
         """Write the table, the draws and the failures of all data sets."""
         if self._draws:
-            arviz_data.save(self.combined(), out / POSTERIORS, overwrite=True)
+            arviz_data.save(self.combined(), out / "posteriors.nc", overwrite=True)
             rows = self.summary.reset_index().set_index("data set")
-            tables.write_csv(rows, out / SUMMARY, overwrite=True, index_label="data set")
-        (out / FAILED).unlink(missing_ok=True)
+            tables.write_csv(rows, out / "summary.csv", overwrite=True, index_label="data set")
+        (out / "failed.csv").unlink(missing_ok=True)
         if self.failed:
             reasons = pd.DataFrame({"reason": self.failed})
-            tables.write_csv(reasons, out / FAILED, overwrite=True, index_label="data set")
+            tables.write_csv(reasons, out / "failed.csv", overwrite=True, index_label="data set")
 
 
 def fit_many(
@@ -240,8 +230,7 @@ def fit_many(
     pairs = list(data_sets.items() if isinstance(data_sets, Mapping) else data_sets)
     if not pairs:
         raise ValueError("data_sets is empty; expected at least one pair of a name and (times, y).")
-    each = dict(each or {})
-    names = [name for name, _ in pairs]
+    each, names = dict(each or {}), dict(pairs)
     for name in each:
         if name not in names:
             raise ValueError(checks.unknown("data set in each", name, names))

@@ -95,6 +95,16 @@ def test_what_is_stored_is_not_fitted_again(folder, monkeypatch):
     assert not (out / "failed.csv").exists()
 
 
+def test_progress_is_shown_unless_it_is_switched_off(folder, monkeypatch, capfd):
+    monkeypatch.setattr(fit_tasks, "fit", functools.wraps(lfm.fit)(lambda *arguments, **options: folder[2][0].result))
+    lines = []
+    for options in ({}, {"report": lines.append}, {"progress": False}, {"report": lines.append, "progress": False}):
+        lfm.fit_many(motif.model, data_sets(1), **options, **OPTIONS).run()
+        captured = capfd.readouterr()
+        assert captured.out == "" and ("1 of 1 tasks, plant_0" in captured.err) is (not options)
+    assert len(lines) == 1
+
+
 def other(times, y=None):
     motif.model(times, y, spread=0.5)
 
