@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.model.user_functions import TracedFunction
+from lfm_ppl.model.user_functions import TracedFunction, Unknown
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.calendar_time import named
 
@@ -102,7 +102,7 @@ class InputRead:
 
     Attributes:
         interpolation: interpolation of the input.
-        times, values: table of the input.
+        times, values: table of the input; the values are None if they are computed and not known.
         slope, offset: coefficients of the time of the read, which may be traced; a lag is ``-offset``.
     """
 
@@ -121,7 +121,7 @@ class InputRead:
     def breakpoints(self) -> Any:
         """Return the times of the model (K,) at which the input jumps or has a kink."""
         times = self.times
-        values = checks.concrete(self.values)
+        values = None if self.values is None else checks.concrete(self.values)
         if np.shape(times)[0] < 2:
             return np.zeros(0)
         if values is None or checks.traced(times):
@@ -156,32 +156,33 @@ def input_reads(functions: Sequence[TracedFunction], first: float, last: float) 
     for function in functions:
         consts = function.closed.consts
         # Random numbers instead of tracers show whether the time of the read is affine in t.
-        trial_consts = [generator.uniform(0.5, 1.5, np.shape(value)).astype(value.dtype)
-                 if isinstance(value, jax.core.Tracer) else value for value in consts]
-        calls = zip(*(function.table_calls(_MARK, t, trial_consts) for t in trials), strict=True)
-        exact = zip(*(function.table_calls(_MARK, t, consts) for t in (0.0, 1.0)), strict=True)
-        pairs = zip(calls, exact, strict=True)
-        for position, (trial, ((name, times, values, at_zero), (*_, at_one))) in enumerate(pairs):
-            reads = [call[-1] for call in trial]
-            if times is None or any(read is None for read in (*reads, at_zero, at_one)):
+        trial_consts = [generator.uniform(0.5, 1.5, np.shape(value)).astype(value.dtype) if checks.traced(value)
+                        else value for value in consts]
+        calls = zip(*(function.table_reads(_MARK, t, trial_consts) for t in trials), strict=True)
+        exact = zip(*(function.table_reads(_MARK, t, consts) for t in (0.0, 1.0)), strict=True)
+        for position, (trial, (at_zero, at_one)) in enumerate(zip(calls, exact, strict=True)):
+            reads = [call.time for call in trial]
+            if any(isinstance(value, Unknown) for value in (at_zero.times, *reads, at_zero.time, at_one.time)):
                 continue  # the time depends on the state, or on a variable of a loop
-            interpolation, _, input_name = name[name.index(_MARK) + len(_MARK):].split("_", 2)
+            interpolation, _, input_name = _settings(at_zero.name)
+            values = None if isinstance(at_zero.values, Unknown) else at_zero.values
             slope = reads[1] - reads[0]
             error = max(np.max(np.abs(read - reads[0] - slope * t)) for read, t in zip(reads, trials, strict=True))
             size = max(np.max(np.abs(read)) for read in reads) + np.max(np.abs(slope)) * max(np.abs(trials))
             if error > 1e-9 * size or np.any(slope == 0):
                 if _is_read_in_place(function, position, first, last):
-                    results.append(InputRead(interpolation, times, values, 1.0, 0.0))
+                    results.append(InputRead(interpolation, at_zero.times, values, 1.0, 0.0))
                 else:
-                    _refuse_read(function.label, input_name, checks.traced((at_zero, at_one)), bool(np.all(slope == 0)))
+                    _refuse_read(function.label, input_name, checks.traced((at_zero.time, at_one.time)),
+                                 bool(np.all(slope == 0)))
                 continue
             # A slope that depends on a random parameter is not one by chance.
             is_unit = np.all(np.abs(slope - 1.0) < 1e-9)
-            flat = [jnp.ravel(a) if checks.traced(a) else np.ravel(a) for a in (at_zero, at_one)]
+            flat = [jnp.ravel(time) if checks.traced(time) else np.ravel(time) for time in (at_zero.time, at_one.time)]
             for index in range(np.size(reads[0])):
-                time_at_zero, time_at_one = (a[index] for a in flat)
+                time_at_zero, time_at_one = (times[index] for times in flat)
                 slope_at_index = 1.0 if is_unit else time_at_one - time_at_zero
-                results.append(InputRead(interpolation, times, values, slope_at_index, time_at_zero))
+                results.append(InputRead(interpolation, at_zero.times, values, slope_at_index, time_at_zero))
     return results
 
 
@@ -197,8 +198,8 @@ def _is_read_in_place(function: TracedFunction, position: int, first: float, las
     if checks.traced(function.closed.consts):
         return False
     times = np.linspace(first, last, _SAMPLE_TIMES)
-    reads = [list(function.table_calls(_MARK, t, function.closed.consts))[position][-1] for t in times]
-    if any(np.size(read) != 1 for read in reads if read is not None) or any(read is None for read in reads):
+    reads = [list(function.table_reads(_MARK, t, function.closed.consts))[position].time for t in times]
+    if any(isinstance(read, Unknown) or np.size(read) != 1 for read in reads):
         return False
     read_times = np.ravel(reads)
     error = np.max(np.abs(read_times - np.clip(times, read_times.min(), read_times.max())))
@@ -229,10 +230,12 @@ def check_reads(functions: Sequence[TracedFunction], first: float, last: float) 
     """
     violations: dict[str, set[str]] = {"warn": set(), "error": set()}
     for function in functions:
-        for name, table, read_times in (read for t in (first, last) for read in function.table_reads(_MARK, t)):
-            interpolation, policy, input_name = name[name.index(_MARK) + len(_MARK):].split("_", 2)
-            if policy not in violations or table.ndim != 1 or table.size < 2:
+        for read in (read for t in (first, last) for read in function.table_reads(_MARK, t, function.concrete_consts)):
+            interpolation, policy, input_name = _settings(read.name)
+            if policy not in violations or read.is_conditional or isinstance(read.time, Unknown) or isinstance(
+                    read.times, Unknown) or np.ndim(read.times) != 1 or np.size(read.times) < 2:
                 continue
+            table, read_times = np.asarray(read.times), np.asarray(read.time)
             end = table[-1] + (table[-1] - table[-2] if interpolation == "previous" else 0.0)
             rounding = 4 * np.finfo(float).eps * max(abs(table[0]), abs(end), abs(first), abs(last))
             slack = 1e-9 * max(end - table[0], last - first) + rounding
@@ -267,15 +270,14 @@ def breakpoints_within(reads: Sequence[InputRead], first: float, last: float) ->
     return fixed[(fixed > first) & (fixed < last)], jnp.concatenate(traced) if traced else np.zeros(0)
 
 
-def has_inputs(function: TracedFunction) -> bool:
-    """Return whether a function reads a known input."""
-    return function.has(_MARK)
+def has_inputs(function: TracedFunction, is_limited: bool = False) -> bool:
+    """Return whether a function reads a known input, or one that must not be read beyond its table."""
+    return any(_MARK in name and not (is_limited and _settings(name)[1] == "hold") for name in function.names())
 
 
-def has_limited_inputs(function: TracedFunction) -> bool:
-    """Return whether a function reads a known input that must not be read beyond its table."""
-    return any(function.has(f"{_MARK}{interpolation}_{policy}_") for interpolation in _INTERPOLATIONS
-               for policy in _OUTSIDE if policy != "hold")
+def _settings(name: str) -> list[str]:
+    """Return interpolation, policy outside and name of the input from the name of its reader."""
+    return name[name.index(_MARK) + len(_MARK):].split("_", 2)
 
 
 @functools.cache

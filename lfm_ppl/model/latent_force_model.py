@@ -23,11 +23,14 @@ import numpy as np
 
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.model.gaussian import Gaussian
-from lfm_ppl.model.inputs import InputRead, check_reads, has_inputs, has_limited_inputs, input_reads
+from lfm_ppl.model.inputs import InputRead, check_reads, has_inputs, input_reads
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.user_functions import TracedFunction, trace
 from lfm_ppl.utils import checks
+
+_ROOTS = {"sqrt", "rsqrt", "cbrt", "pow"}
+"""Primitives whose derivative at zero may be infinite."""
 
 
 class LatentForceModel(eqx.Module):
@@ -106,7 +109,10 @@ class LatentForceModel(eqx.Module):
         _check_types(dynamics, observation, initial_state)
         self.force_names, self.forces = _forces_by_name(forces)
         self.dynamics, self.initial_state = dynamics, initial_state
-        self.observation = self._with_output_sizes(observation)
+        if isinstance(observation, ObservationFamily):
+            observation = observation.with_output_sizes(
+                lambda function: self._trace_observation(function).shape.shape[0])
+        self.observation = observation
         if initial_time is not None:
             checks.finite("initial_time", initial_time)
         # A concrete time stays a NumPy array: inside jit jnp.asarray returns a tracer, but time grids need the number.
@@ -127,8 +133,8 @@ class LatentForceModel(eqx.Module):
         self.nonlinear_inputs = None if nonlinear_inputs is None else tuple(nonlinear_inputs)
         for name in self.nonlinear_inputs or ():
             checks.one_of("name in nonlinear_inputs", name, (*self.state_names, *self.force_names))
-        self._functions_with_roots = tuple(name for name, function in functions.items() if function.has_roots)
-        self._has_limited_inputs = any(has_limited_inputs(function) for function in functions.values())
+        self._functions_with_roots = tuple(name for name, function in functions.items() if _ROOTS & function.names())
+        self._has_limited_inputs = any(has_inputs(function, is_limited=True) for function in functions.values())
         self._has_integrated_inputs = any(has_inputs(function) for function in _integrated_functions(functions))
         self._check_precision()
         if self.initial_time is not None or not any(
@@ -145,69 +151,61 @@ class LatentForceModel(eqx.Module):
         """The forces in their order."""
         return tuple(self.forces[name] for name in self.force_names)
 
-    def _with_output_sizes(self, observation: Any) -> GaussianObservation | ObservationFamily:
-        """Return the observation; a family gets the number of its outputs."""
-        if not isinstance(observation, ObservationFamily):
-            return observation
+    @property
+    def _arguments(self) -> tuple[Any, Any, Any]:
+        """x, u and t for traces."""
         u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
-        arguments = (self.initial_state.mean, u, jnp.zeros(()))
+        return self.initial_state.mean, u, jnp.zeros(())
 
-        def output_size(function: Callable) -> int:
-            return _vector_size(trace("the observation function", "h(x, u, t)", function, *arguments).shape)
-
-        return observation.with_output_sizes(output_size)
+    def _trace_observation(self, function: Callable) -> TracedFunction:
+        """Return a traced observation function; raise ValueError unless it returns a vector."""
+        traced = trace("the observation function", "h(x, u, t)", function, *self._arguments)
+        if len(getattr(traced.shape, "shape", ())) != 1:
+            raise ValueError(f"the observation function must return a vector (D,), got {_describe(traced.shape)}. For "
+                             "one output, return x[:1] or jnp.array([...]).")
+        return traced
 
     def _trace_functions(self) -> dict[str, TracedFunction]:
         """Return the traced functions of the model by name, after checks of their shapes and indices."""
-        size = self.initial_state.mean.shape[0]
-        u = jax.ShapeDtypeStruct((len(self.force_names),), jnp.result_type(float))
-        arguments = (self.initial_state.mean, u, jnp.zeros(()))
-        drift = trace("dynamics", "f(x, u, t)", self.dynamics, *arguments)
-        if getattr(drift.shape, "shape", None) != (size,):
-            raise ValueError(f"dynamics must return one derivative for each of the {size} entries of "
-                             f"initial_state.mean, shape ({size},); it returned {_describe(drift.shape)}."
-                             f"{'' if getattr(drift.shape, 'shape', ()) else ' Return jnp.array([...]).'}")
-        functions = {"dynamics": drift, "observation": self._trace_observation(arguments)}
+        arguments, observation = self._arguments, self.observation
+        functions = {"dynamics": trace("dynamics", "f(x, u, t)", self.dynamics, *arguments)}
         if callable(self.process_noise):
-            noise = trace("process_noise", "(x, u, t)", self.process_noise, *arguments)
-            shape: Any = getattr(noise.shape, "shape", ())
-            if len(shape) != 2 or shape[0] != size:
-                raise ValueError(f"process_noise must return a dispersion matrix ({size}, S), got {shape}.")
-            functions["process_noise"] = noise
-        if callable(self.observation.covariance):
-            functions["covariance"] = trace("the observation covariance", "(x, u, t)", self.observation.covariance,
+            functions["process_noise"] = trace("process_noise", "(x, u, t)", self.process_noise, *arguments)
+        self._check_state_shapes(**functions)
+        functions["observation"] = self._trace_observation(observation.function)
+        (outputs,) = functions["observation"].shape.shape
+        shape = jax.eval_shape(observation.covariance_at, *arguments, 0).shape
+        if shape != (outputs, outputs):
+            raise ValueError(f"the observation has {outputs} components, so its covariance must be ({outputs},) or "
+                             f"({outputs}, {outputs}); it is {shape}.")
+        if any(not 0 <= index < outputs for index in observation.angular):
+            raise ValueError(f"angular indices must lie in 0..{outputs - 1}, got {observation.angular}.")
+        if callable(observation.covariance):
+            functions["covariance"] = trace("the observation covariance", "(x, u, t)", observation.covariance,
                                             *arguments)
-        functions |= self._trace_deterministics(arguments)
-        for function in functions.values():
-            function.check_indices(("x", "u"))
-        for name, force in self.forces.items():
-            if callable(force.mean):
-                functions[f"mean of {name}"] = trace(f"the mean of the force {name!r}", "(t)", force.mean_at,
-                                                     arguments[-1])
-        return functions
-
-    def _trace_deterministics(self, arguments: tuple) -> dict[str, TracedFunction]:
-        functions = {}
         for name, function in self.deterministics.items():
-            label = f"the deterministic {name!r}"
-            traced = trace(label, "(x, u, t)", function, *arguments)
+            traced = trace(f"the deterministic {name!r}", "(x, u, t)", function, *arguments)
             shape = getattr(traced.shape, "shape", traced.shape)
             if shape != ():
-                raise ValueError(f"{label} must return one number, shape (); it returned {shape}. The entry of a "
-                                 "vector is x[0], u[0].")
+                raise ValueError(f"{traced.label} must return one number, shape (); it returned {shape}. The entry of "
+                                 "a vector is x[0], u[0].")
             functions[f"deterministic {name}"] = traced
-        return functions
+        for traced in functions.values():
+            traced.check_indices(("x", "u"))
+        means = {f"mean of {name}": trace(f"the mean of the force {name!r}", "(t)", force.mean_at, arguments[2])
+                 for name, force in self.forces.items() if callable(force.mean)}
+        return functions | means
 
-    def _trace_observation(self, arguments: tuple) -> TracedFunction:
-        traced = trace("the observation function", "h(x, u, t)", self.observation.function, *arguments)
-        outputs = _vector_size(traced.shape)
-        covariance = jax.eval_shape(self.observation.covariance_at, *arguments, 0)
-        if covariance.shape != (outputs, outputs):
-            raise ValueError(f"the observation has {outputs} components, so its covariance must be ({outputs},) or "
-                             f"({outputs}, {outputs}); it is {covariance.shape}.")
-        if any(not 0 <= index < outputs for index in self.observation.angular):
-            raise ValueError(f"angular indices must lie in 0..{outputs - 1}, got {self.observation.angular}.")
-        return traced
+    def _check_state_shapes(self, dynamics: TracedFunction, process_noise: TracedFunction | None = None) -> None:
+        """Raise ValueError unless dynamics and process noise have a row for each state."""
+        size, shape = self.initial_state.mean.shape[0], getattr(dynamics.shape, "shape", None)
+        if shape != (size,):
+            raise ValueError(f"dynamics must return one derivative for each of the {size} entries of "
+                             f"initial_state.mean, shape ({size},); it returned {_describe(dynamics.shape)}."
+                             f"{'' if shape else ' Return jnp.array([...]).'}")
+        noise = (size, 0) if process_noise is None else getattr(process_noise.shape, "shape", ())
+        if len(noise) != 2 or noise[0] != size:
+            raise ValueError(f"process_noise must return a dispersion matrix ({size}, S), got {noise}.")
 
     def _check_precision(self) -> None:
         """Raise ValueError if a part of the model has single precision while JAX computes in double precision."""
@@ -267,34 +265,29 @@ class LatentForceModel(eqx.Module):
         x = self.initial_state.mean
         # Inside compiled code the result of this addition is a tracer, even for a concrete time.
         t = jnp.asarray(0.0 if time is None else time, float) + 0.0
-        if checks.traced((self, t)):
+        u = None if checks.traced((self, t)) else jnp.asarray([force.mean_at(t) for force in self.force_list], float)
+        if u is None or checks.traced(u):
             return
-        u = jnp.asarray([force.mean_at(t) for force in self.force_list], float)
-        if checks.traced(u):
-            return
+        observation = self.observation
         when = "" if time is None else f", t = {float(time):g}"
         where = f"at the prior mean x = {np.asarray(x)}, u = {np.asarray(u)}{when}"
         for label, function, names in (("dynamics", self.dynamics, self.state_names),
-                                       ("observation function", self.observation.function, self.output_names)):
+                                       ("observation function", observation.function, self.output_names)):
             value = checks.concrete(function(x, u, t))
             if value is not None and not np.all(np.isfinite(value)):
-                name = names[int(np.argmin(np.isfinite(value)))]
-                raise ValueError(f"the {label} returned {value} {where}: the entry for {name!r} is not finite. "
-                                 "Change initial_state.mean, or guard the expression (for example jnp.maximum)."
-                                 + self._trace_functions()[label.split()[0]].not_finite(*map(np.asarray, (x, u, t))))
+                raise ValueError(f"the {label} returned {value} {where}: the entry for "
+                                 f"{names[int(np.argmin(np.isfinite(value)))]!r} is not finite. Change "
+                                 "initial_state.mean, or guard the expression (for example jnp.maximum).")
             if label.split()[0] in self._functions_with_roots:
                 self._check_derivative(label, function, names, (x, u, t), where)
-            if value is not None and function is self.observation.function and isinstance(self.observation,
-                                                                                           ObservationFamily):
-                self.observation.check_predictor(value, where, names)
-        if callable(self.process_noise):
-            dispersion = checks.concrete(self.process_noise(x, u, t))
-            if dispersion is not None and not np.all(np.isfinite(dispersion)):
-                raise ValueError(f"process_noise is not finite {where}: {dispersion.tolist()}.")
-        if callable(self.observation.covariance):
-            noise = checks.concrete(self.observation.covariance_at(x, u, t, jnp.asarray(0)))
-            if noise is not None:
-                checks.covariance_matrix(f"the observation covariance {where}", noise)
+            if value is not None and label != "dynamics" and isinstance(observation, ObservationFamily):
+                observation.check_predictor(value, where, names)
+        dispersion = checks.concrete(self.process_noise(x, u, t)) if callable(self.process_noise) else None
+        if dispersion is not None and not np.all(np.isfinite(dispersion)):
+            raise ValueError(f"process_noise is not finite {where}: {dispersion.tolist()}.")
+        if callable(observation.covariance):
+            checks.covariance_matrix(f"the observation covariance {where}",
+                                     observation.covariance_at(x, u, t, jnp.asarray(0)))
 
     @staticmethod
     def _check_derivative(label: str, function: Callable, names: Sequence[str], arguments: tuple, where: str) -> None:
@@ -337,14 +330,6 @@ def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
                         "lfm.GaussianObservation(lambda x, u, t: x, variances).")
     if not isinstance(initial_state, Gaussian):
         raise TypeError(f"initial_state must be an lfm.Gaussian, got {type(initial_state).__name__}.")
-
-
-def _vector_size(result: Any) -> int:
-    """Return the length of the result of an observation function; raise ValueError unless it is a vector."""
-    if len(getattr(result, "shape", ())) != 1:
-        raise ValueError(f"the observation function must return a vector (D,), got {_describe(result)}. "
-                         "For one output, return x[:1] or jnp.array([...]).")
-    return result.shape[0]
 
 
 def _describe(result: Any) -> str:
