@@ -128,48 +128,42 @@ def model(observation, mean=0.0):
     return lfm.LatentForceModel(lambda x, u, t: -x, {}, observation, lfm.Gaussian(mean * jnp.ones(2), jnp.eye(2)))
 
 
-@pytest.mark.parametrize("family, entry, needs", [
-    (lfm.PoissonObservation(state), -1.0, "counts: whole numbers of at least zero"),
-    (lfm.NegativeBinomialObservation(state, 2.0), 0.5, "counts: whole numbers of at least zero"),
-    (lfm.BinomialObservation(state, 4), 5.0, "counts: whole numbers from zero to total_count"),
-    (lfm.BernoulliObservation(state), 2.0, r"0 \(no\) or 1 \(yes\)"),
-    (lfm.Observation(state, lambda f: dist.Poisson(jnp.exp(f))), -2.0, None),
-], ids=lambda value: type(value).__name__ if isinstance(value, lfm.ObservationFamily) else "")
-def test_data_that_a_family_cannot_give_are_errors_that_name_row_and_column(family, entry, needs):
-    y = np.array([[0.0, np.nan], [1.0, entry]])
-    what = f"{type(family).__name__} needs {needs}" if needs else "the distribution needs"
-    message = rf"y\[1, 1\] \(y1, row 2 of the data\) is {entry:g}, but {what}.*in the order y0, y1"
-    for call in (lambda: lfm.filter(model(family), [0.0, 1.0], y), lambda: lfm.smooth(model(family), [0.0, 1.0], y),
+GAUSSIAN = lfm.GaussianObservation(state, jnp.ones(2))
+BOTH = lfm.Observations(GAUSSIAN, lfm.BernoulliObservation(state))
+
+
+@pytest.mark.parametrize("family, row, message", [
+    (lfm.PoissonObservation(state), [1.0, -1.0], r"y\[1, 1\] \(y1, row 2 of the data\) is -1, but Poisson.*y0, y1"),
+    (lfm.NegativeBinomialObservation(state, 2.0), [1.0, 0.5], r"y\[1, 1\] .* is 0.5, but NegativeBinomial"),
+    (lfm.BinomialObservation(state, 4), [1.0, 5.0], r"y\[1, 1\] .* is 5, but Binomial"),
+    (lfm.BernoulliObservation(state), [1.0, 2.0], r"y\[1, 1\] .* is 2, but Bernoulli"),
+    (lfm.Observation(state, lambda f: dist.Poisson(jnp.exp(f))), [1.0, -2.0], r"y\[1, 1\] .* is -2, but the dist"),
+    (BOTH, [0.3, -2.0, 1.0, 0.5], r"y\[1, 3\] \(y3, row 2 of the data\) is 0.5, but Bernoulli"),
+])
+def test_impossible_data_are_errors_that_name_row_and_column(family, row, message):
+    y = np.array([np.full(len(row), np.nan), row])
+    for call in (lambda: lfm.filter(model(family), [0.0, 1.0], y),
                  lambda: lfm.MarginalLikelihood(model(family), [0.0, 1.0]).log_prob(y)):
         with pytest.raises(ValueError, match=message):
             call()
 
 
-def test_columns_of_families_side_by_side_keep_their_numbers():
-    both = lfm.Observations(lfm.GaussianObservation(lambda x, u, t: x, jnp.ones(2)), lfm.BernoulliObservation(state))
-    said = r"y\[0, 3\] \(y3, row 1 of the data\) is 0.5, but BernoulliObservation needs 0"
-    with pytest.raises(ValueError, match=said):
-        lfm.filter(model(both), [0.0], np.array([[0.3, -2.0, 1.0, 0.5]]))
-
-
 @pytest.mark.parametrize("make, message", [
-    (lambda: lfm.StudentTObservation(state, 0.0, 1.0), "df must be finite and greater than zero"),
-    (lambda: lfm.StudentTObservation(state, 4.0, -1.0), "scale must be finite and greater than zero"),
-    (lambda: lfm.NegativeBinomialObservation(state, [1.0, -1.0]), "concentration must be finite and greater"),
+    (lambda: lfm.StudentTObservation(state, 0.0, 1.0), "df must be"),
+    (lambda: lfm.StudentTObservation(state, 4.0, -1.0), "scale must be"),
+    (lambda: lfm.NegativeBinomialObservation(state, [1.0, -1.0]), "concentration must be"),
     (lambda: lfm.PoissonObservation(state, "log"), "unknown link 'log'.*Known: exp, softplus, identity"),
     (lambda: lfm.CensoredObservation(state, 1.0, left=2.0, right=1.0), "left must lie below right"),
-    (lambda: model(lfm.PoissonObservation(state, exposure=np.ones(3))),
-     r"exposure of PoissonObservation must be .*\(2,\)"),
+    (lambda: model(lfm.PoissonObservation(state, exposure=np.ones(3))), r"exposure of PoissonObservation .*\(2,\)"),
     (lambda: lfm.filter(model(lfm.PoissonObservation(state, exposure=np.ones((3, 2)))), [0.0], [[1.0, 1.0]]),
-     "exposure of PoissonObservation has 3 rows, one for each time, but there are 1 times"),
+     "exposure of PoissonObservation has 3 rows"),
     (lambda: model(lfm.PoissonObservation(lambda x, u, t: x[0])), "must return a vector"),
-    (lambda: model(lfm.PoissonObservation(state), mean=800.0), "the law of the output 'y0' is not finite at the prior"),
+    (lambda: model(lfm.PoissonObservation(state), mean=800.0), "output 'y0' is not finite at the prior"),
     (lambda: model(lfm.Observation(state, lambda f: dist.Poisson(1.0))), r"batch shape \(2,\)"),
     (lambda: lfm.Observations(lfm.GaussianObservation(state, jnp.eye(2))), "needs variances"),
-    (lambda: model(lambda x, u, t: x), "or a family such as lfm.PoissonObservation"),
 ])
 def test_errors(make, message):
-    with pytest.raises((ValueError, TypeError), match=message):
+    with pytest.raises(ValueError, match=message):
         make()
 
 

@@ -3,8 +3,8 @@
 1. A family holds the function h and its parameters, and implements `log_prob` and `sample` entry by entry.
 2. Optional methods serve plots and checks: `cumulative` for residuals, `mean` for predictions, `problem` for impossible
    data, `overflows` for impossible predictors, `possible` for placeholders of missing entries.
-3. Parameters named in ``per_entry`` may have one value per row of the data; `at` selects a row, and `typical` averages
-   the rows for times without data.
+3. Parameters named in ``per_entry`` may have one value per row of the data; `select_row` selects a row, and `typical`
+   averages the rows for times without data.
 4. The properties of Gaussian observations (``covariance``, ``angular``, ...) exist with trivial values, so that a model
    can treat both kinds of observations alike.
 5. `check_shapes`, `check_rows`, `check_predictor` and `check_data` raise errors that name the entry.
@@ -100,24 +100,24 @@ class ObservationFamily(eqx.Module):
 
     def select_row(self, row: Any) -> ObservationFamily:
         """Return the family for one row of the data: parameters (T, D) become (D,)."""
-        rows = {name: getattr(self, name)[row] for name in self.per_entry if np.ndim(getattr(self, name)) == 2}
-        if not rows:
-            return self
-        names = list(rows)
-        return eqx.tree_at(lambda family: [getattr(family, name) for name in names], self, list(rows.values()))
-
-    def has_row_parameters(self) -> bool:
-        """Return whether a parameter differs between rows, so that times without data have no distribution."""
-        for name in self.per_entry:
-            if np.ndim(getattr(self, name)) == 2:
-                values = checks.concrete(getattr(self, name))
-                if values is None or bool((values != values[:1]).any()):
-                    return True
-        return False
+        return self._reduce_rows(lambda parameter: parameter[row])
 
     def typical(self) -> ObservationFamily:
         """Return the family with parameters (T, D) averaged over the rows, for times without data."""
-        return _average_rows(self)
+        return self._reduce_rows(lambda parameter: jnp.mean(parameter, axis=0))
+
+    def _row_parameters(self) -> list[str]:
+        return [name for name in self.per_entry if np.ndim(getattr(self, name)) == 2]
+
+    def _reduce_rows(self, reduce: Callable[[jax.Array], jax.Array]) -> ObservationFamily:
+        names = self._row_parameters()
+        return self if not names else eqx.tree_at(lambda family: [getattr(family, name) for name in names], self,
+                                                  [reduce(getattr(self, name)) for name in names])
+
+    def has_row_parameters(self) -> bool:
+        """Return whether a parameter differs between rows, so that times without data have no distribution."""
+        values = [checks.concrete(getattr(self, name)) for name in self._row_parameters()]
+        return any(value is None or bool((value != value[:1]).any()) for value in values)
 
     # Attributes that `GaussianObservation` has as well.
 
@@ -151,11 +151,10 @@ class ObservationFamily(eqx.Module):
 
     def check_rows(self, rows: int) -> None:
         """Raise ValueError if a parameter (T, D) has another number of rows than the data."""
-        for name in self.per_entry:
-            shape = np.shape(getattr(self, name))
-            if len(shape) == 2 and shape[0] != rows:
-                raise ValueError(f"{name} of {type(self).__name__} has {shape[0]} rows, one for each time, but there "
-                                 f"are {rows} times.")
+        for name in self._row_parameters():
+            if (size := np.shape(getattr(self, name))[0]) != rows:
+                raise ValueError(f"{name} of {type(self).__name__} has {size} rows, one for each time, but there are "
+                                 f"{rows} times.")
 
     def check_predictor(self, predictor: np.ndarray, where: str, names: Sequence[str]) -> None:
         """Raise ValueError if the distribution of an entry is not finite at a predictor (D,)."""
@@ -195,16 +194,6 @@ class ObservationFamily(eqx.Module):
             order = f" Outputs are in the order {', '.join(names)}." if len(names) > 1 else ""
             raise ValueError(f"y[{row}, {index}]{label} is {data[row, column]:g}, but {requirement}; use NaN for a "
                              f"missing entry.{order}")
-
-
-def _average_rows(family: ObservationFamily) -> ObservationFamily:
-    """Return the family with parameters (T, D) replaced by their means (D,)."""
-    rows = {name: jnp.mean(getattr(family, name), axis=0) for name in family.per_entry
-            if np.ndim(getattr(family, name)) == 2}
-    if not rows:
-        return family
-    names = list(rows)
-    return eqx.tree_at(lambda member: [getattr(member, name) for name in names], family, list(rows.values()))
 
 
 def as_parameter(name: str, value: Any, positive: bool = True) -> jax.Array:

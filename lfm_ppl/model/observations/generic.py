@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,6 @@ class Observation(ObservationFamily):
     """
 
     make: Callable[[jax.Array], dist.Distribution]
-    per_entry: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, function: Callable[..., jax.Array], make: Callable[[jax.Array], dist.Distribution]):
         if not callable(make):

@@ -64,7 +64,6 @@ class Observations(ObservationFamily):
 
     parts: tuple[ObservationFamily, ...]
     sizes: tuple[int, ...] | None = eqx.field(static=True)
-    per_entry: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, *parts: Any):
         if not parts:
@@ -82,20 +81,22 @@ class Observations(ObservationFamily):
             object.__setattr__(observations, name, value)
         return observations
 
-    def _columns(self) -> list[slice]:
+    def _parts_and_columns(self) -> list[tuple[ObservationFamily, slice]]:
         if self.sizes is None:
             raise ValueError("the columns of the parts of Observations are known within a model only; use "
                              "model.observation.")
         stops = np.cumsum(self.sizes)
-        return [slice(int(stop) - size, int(stop)) for stop, size in zip(stops, self.sizes, strict=True)]
+        return [(part, slice(int(stop) - size, int(stop)))
+                for part, stop, size in zip(self.parts, stops, self.sizes, strict=True)]
 
-    def _parts_and_columns(self) -> Any:
-        return zip(self.parts, self._columns(), strict=True)
+    def _by_part(self, method: str, *arrays: Any) -> list[Any]:
+        """Return the results of a method of each part, for its columns of the arrays."""
+        return [getattr(part, method)(*(array[columns] for array in arrays))
+                for part, columns in self._parts_and_columns()]
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return the log densities (D,)."""
-        return jnp.concatenate([part.log_prob(predictor[columns], y[columns])
-                                for part, columns in self._parts_and_columns()])
+        return jnp.concatenate(self._by_part("log_prob", predictor, y))
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw entries (D,)."""
@@ -105,28 +106,27 @@ class Observations(ObservationFamily):
 
     def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return P(data < y) and P(data <= y), (D,) each."""
-        pairs = [part.cumulative(predictor[columns], y[columns]) for part, columns in self._parts_and_columns()]
-        return jnp.concatenate([below for below, _ in pairs]), jnp.concatenate([up_to for _, up_to in pairs])
+        below, up_to = zip(*self._by_part("cumulative", predictor, y), strict=True)
+        return jnp.concatenate(below), jnp.concatenate(up_to)
 
     def possible(self, predictor: jax.Array) -> jax.Array:
         """Return entries (D,) inside the supports."""
-        return jnp.concatenate([part.possible(predictor[columns]) for part, columns in self._parts_and_columns()])
+        return jnp.concatenate(self._by_part("possible", predictor))
 
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return the expected entries (D,)."""
-        return jnp.concatenate([part.mean(predictor[columns]) for part, columns in self._parts_and_columns()])
+        return jnp.concatenate(self._by_part("mean", predictor))
+
+    def overflows(self, predictor: np.ndarray) -> np.ndarray:
+        """Return for which entries the distribution of the data is not finite."""
+        return np.concatenate(self._by_part("overflows", predictor))
 
     def has_row_parameters(self) -> bool:
         """Return whether a parameter of a part differs between rows of the data."""
         return any(part.has_row_parameters() for part in self.parts)
 
-    def typical(self) -> Observations:
-        """Return the observations with parameters averaged over the rows."""
-        return eqx.tree_at(lambda family: family.parts, self, tuple(part.typical() for part in self.parts))
-
-    def select_row(self, row: Any) -> Observations:
-        """Return the observations for one row of the data."""
-        return eqx.tree_at(lambda family: family.parts, self, tuple(part.select_row(row) for part in self.parts))
+    def _reduce_rows(self, reduce: Callable[[jax.Array], jax.Array]) -> Observations:
+        return eqx.tree_at(lambda family: family.parts, self, tuple(part._reduce_rows(reduce) for part in self.parts))
 
     def check_shapes(self, outputs: int) -> None:
         """Check the parameters of the parts."""
@@ -137,10 +137,6 @@ class Observations(ObservationFamily):
         """Check the parameters of the parts."""
         for part in self.parts:
             part.check_rows(rows)
-
-    def overflows(self, predictor: np.ndarray) -> np.ndarray:
-        """Return for which entries the distribution of the data is not finite."""
-        return np.concatenate([part.overflows(predictor[columns]) for part, columns in self._parts_and_columns()])
 
     def check_data(self, y: Any, first_column: int = 0, names: Sequence[str] = ()) -> None:
         """Check the columns of each part."""

@@ -1,4 +1,4 @@
-"""Numbers of successes among known numbers of trials."""
+"""Binary data, and numbers of successes among known numbers of trials."""
 
 from __future__ import annotations
 
@@ -15,7 +15,63 @@ from lfm_ppl.model.observations.family import ObservationFamily, as_parameter, i
 from lfm_ppl.model.observations.links import PROBABILITIES, link_name
 
 
-class BinomialObservation(ObservationFamily):
+class _TrialObservation(ObservationFamily):
+    """Trials that succeed with the probability g(f): link g, predictor f."""
+
+    link: str = eqx.field(static=True)
+
+    def __init__(self, function: Callable[..., jax.Array], link: str = "logit"):
+        self.function = function
+        self.link = link_name(link, PROBABILITIES)
+
+    def mean(self, predictor: jax.Array) -> jax.Array:
+        """Return the probability of a success, (D,)."""
+        return jnp.exp(PROBABILITIES[self.link][0](predictor))
+
+    def overflows(self, predictor: np.ndarray) -> np.ndarray:
+        """Return whether the predictor is not finite, or is not a probability under the identity link, (D,)."""
+        return ~np.isfinite(predictor) | ((self.link == "identity") & ((predictor <= 0) | (predictor >= 1)))
+
+
+class BernoulliObservation(_TrialObservation):
+    r"""Binary data: yes (1) or no (0).
+
+        P(y_kd = 1) = g(f_kd),    f_k = h(x, u, t_k).
+
+    Args:
+        function: ``h(x, u, t) -> (D,)``, the predictor f.
+        link: g: "logit", "probit" or "identity" (the predictor is then the probability itself).
+
+    Raises:
+        ValueError: the link is unknown.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> BernoulliObservation(lambda x, u, t: u).log_prob(jnp.zeros(1), jnp.ones(1)).round(4).tolist()
+        [-0.6931]
+    """
+
+    def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
+        """Return log p where y = 1, log(1 - p) where y = 0, (D,)."""
+        log_probability, log_complement = PROBABILITIES[self.link]
+        return jnp.where(y > 0.5, log_probability(predictor), log_complement(predictor))
+
+    def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
+        """Draw zeros and ones (D,)."""
+        return jax.random.bernoulli(key, self.mean(predictor), predictor.shape).astype(predictor.dtype)
+
+    def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return P(data < y) and P(data <= y), (D,) each."""
+        _, log_complement = PROBABILITIES[self.link]
+        complement = jnp.exp(log_complement(predictor))
+        return jnp.where(y > 0.5, complement, 0.0), jnp.where(y > 0.5, 1.0, complement)
+
+    def problem(self, y: np.ndarray) -> tuple[np.ndarray, str]:
+        """Return which data are neither 0 nor 1, and the requirement."""
+        return (y != 0) & (y != 1), "0 (no) or 1 (yes)"
+
+
+class BinomialObservation(_TrialObservation):
     r"""Successes among a known number of trials.
 
         y_kd ~ Binomial(n_kd, g(f_kd)),    f_k = h(x, u, t_k).
@@ -35,13 +91,11 @@ class BinomialObservation(ObservationFamily):
     """
 
     total_count: jax.Array
-    link: str = eqx.field(static=True)
     per_entry: ClassVar[tuple[str, ...]] = ("total_count",)
 
     def __init__(self, function: Callable[..., jax.Array], total_count: Any, link: str = "logit"):
-        self.function = function
+        super().__init__(function, link)
         self.total_count = as_parameter("total_count", total_count)
-        self.link = link_name(link, PROBABILITIES)
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return log C(n, y) + y log p + (n - y) log(1 - p), (D,)."""
@@ -52,8 +106,8 @@ class BinomialObservation(ObservationFamily):
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw counts (D,)."""
-        probability = jnp.exp(PROBABILITIES[self.link][0](predictor))
-        return jax.random.binomial(key, self.total_count, probability, predictor.shape).astype(predictor.dtype)
+        draws = jax.random.binomial(key, self.total_count, super().mean(predictor), predictor.shape)
+        return draws.astype(predictor.dtype)
 
     def cumulative(self, predictor: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return P(data < y) and P(data <= y), (D,) each."""
@@ -64,15 +118,11 @@ class BinomialObservation(ObservationFamily):
 
     def mean(self, predictor: jax.Array) -> jax.Array:
         """Return the expected counts (D,)."""
-        return self.total_count * jnp.exp(PROBABILITIES[self.link][0](predictor))
+        return self.total_count * super().mean(predictor)
 
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str]:
         """Return which data are not counts up to the number of trials, and the requirement."""
         return is_not_count(y) | (y > np.asarray(self.total_count)), "counts: whole numbers from zero to total_count"
-
-    def overflows(self, predictor: np.ndarray) -> np.ndarray:
-        """Return whether the predictor is not finite, or is not a probability under the identity link, (D,)."""
-        return ~np.isfinite(predictor) | ((self.link == "identity") & ((predictor <= 0) | (predictor >= 1)))
 
 
 def _log_power(log_probability: jax.Array, count: jax.Array) -> jax.Array:
