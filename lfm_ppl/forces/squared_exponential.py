@@ -15,6 +15,7 @@ Source: Hartikainen, Seppanen and Sarkka (2012), ICML, section 3.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil, log2
 from typing import Any, ClassVar
@@ -33,6 +34,12 @@ from lfm_ppl.forces.discretise import (
     term_count,
 )
 from lfm_ppl.forces.stretched import Stretched, covariance_of_derivatives
+
+_HIGHEST_FREQUENCY = 12.0
+"""Frequency in units of 1/lengthscale above which the exact process has no power, exp(-72) of S(0)."""
+
+_FREQUENCIES = 400
+"""Number of frequencies in the estimate of the error."""
 
 _LONGEST_STEP = 150.0
 """Dimensionless step lam dt beyond which the transition is zero: every mode has decayed by exp(-65) or more."""
@@ -190,6 +197,38 @@ class SquaredExponential(Stretched):
         """Return S(omega) of the exact process, elementwise."""
         ratio = jnp.asarray(omega) * self.lengthscale
         return self.scale**2 * np.sqrt(2 * np.pi) * self.lengthscale * jnp.exp(-0.5 * ratio**2)
+
+    def approximation_error(self, precision: Callable[[np.ndarray], np.ndarray], spacing: float, count: int) -> float:
+        r"""Return the error of a log likelihood due to the SDE: |mean| + 2 standard deviations over data sets.
+
+        The Fourier coefficients of ``count`` evenly spaced observations of u with noise are nearly independent. The
+        ratio of their variances under the exact process and under the SDE, and the moments of the error, are
+
+            e(omega) = (1 + sum_k q S) / (1 + sum_k q S_n)    at omega + 2 pi k / spacing,
+            |mean| = count/2 avg(e - 1 - log e),    variance = count/2 avg((e - 1)^2),
+
+        where avg is the average over frequencies from zero to pi / spacing.
+
+        Args:
+            precision: q(omega), the inverse of the spectral density of the noise in units of u^2 time.
+            spacing: time between observations.
+            count: number of observations.
+
+        Source: Whittle (1953), Arkiv for Matematik 2.
+        """
+        fit, nyquist, limit = _FITS[self.order], np.pi / spacing, _HIGHEST_FREQUENCY / float(self.lengthscale)
+        highest = min(nyquist, limit)
+        shifts = np.arange(-np.ceil(0.5 * limit / nyquist), np.ceil(0.5 * limit / nyquist) + 1)
+        omega = highest * (np.arange(_FREQUENCIES) + 0.5)[:, None] / _FREQUENCIES + 2.0 * nyquist * shifts
+        ratio = omega * float(self.lengthscale)
+        exact, rational = np.exp(-0.5 * ratio**2), fit.ratio * np.ones(ratio.shape)
+        for roots, power in ((_roots(fit.zeros), 2), (_roots(fit.poles), -2)):
+            rational *= np.prod(np.abs(1.0 - 1j * ratio[..., None] / roots), axis=-1) ** power
+        signal = precision(omega) * float(self.scale) ** 2 * np.sqrt(2.0 * np.pi) * float(self.lengthscale)
+        excess = (1.0 + (signal * exact).sum(axis=1)) / (1.0 + (signal * rational).sum(axis=1)) - 1.0
+        pairs = 0.5 * count * highest / nyquist
+        mean, variance = pairs * (excess - np.log1p(excess)).mean(), pairs * (excess**2).mean()
+        return float(mean + 2.0 * np.sqrt(variance))
 
 
 @dataclass(frozen=True)

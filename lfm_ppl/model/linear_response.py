@@ -1,14 +1,9 @@
-"""The outputs of a linearised model as linear maps of its forces and its initial state.
+"""Linearised models, in which `lfm_ppl.model.resolution` and `lfm_ppl.model.truncation` estimate errors of forces.
 
-`lfm_ppl.model.resolution` and `lfm_ppl.model.truncation` estimate with it the error of the log likelihood due to the
-approximation of a force:
-
-1. Linearise the model at its prior mean (`linearize`).
+1. Linearise the model at its prior mean (`linearized_terms`).
 2. On a time grid, over each step of which a force is taken as linear in time, compute the response of the outputs to
    the forces by one matrix exponential per distinct step (`output_responses`).
-3. The covariance of the outputs follows from covariances of the forces on the grid (`exact_covariance`), the initial
-   state and the noise.
-4. `error_bound` gives the error of the log likelihood from the eigenvalues of the approximate and exact covariances.
+3. `error_bound` gives the error of the log likelihood from the eigenvalues of the approximate and exact covariances.
 
 Source: Whittle (1953), Arkiv för Matematik 2, for the likelihood of an approximate covariance.
 """
@@ -46,29 +41,50 @@ class LinearModel(NamedTuple):
     initial: np.ndarray  # P0 (M, M)
 
 
-ForceTerm = tuple[str, int, Force]
-"""A force that is not a sum, or a term of a sum: the name in the model, the column in the inputs u, the force."""
+class ForceTerm(NamedTuple):
+    """A force that is not a sum, or a term of a sum: the name in the model, the column in the inputs u, the force."""
+
+    name: str
+    column: int
+    force: Force
 
 
-def force_terms(model: LatentForceModel) -> list[ForceTerm]:
-    """Return the forces of a model, with sums replaced by their terms."""
-    pairs = zip(model.force_names, model.force_list, strict=True)
-    return [(name, column, term) for column, (name, force) in enumerate(pairs)
-            for term in (force.forces if isinstance(force, Sum) else (force,))]
+class LinearizedTerm(NamedTuple):
+    """A force of a linearised model, its other forces, and the observed times (N,), N > 1."""
+
+    term: ForceTerm
+    other_terms: list[ForceTerm]
+    linear: LinearModel
+    times: np.ndarray
 
 
-def observed_times(model: LatentForceModel, times: Any, y: Any) -> np.ndarray | None:
-    """Return the times (N,) with observed entries, where the linearised model describes the likelihood.
+def linearized_terms(model: LatentForceModel, times: Any, y: Any,
+                     is_checked: Callable[[Force], bool]) -> list[LinearizedTerm]:
+    """Return the forces that ``is_checked`` selects, also in sums, with the model linearised at its prior mean.
 
     Args:
         model: the latent force model.
         times: (T,).
         y: (T, D), NaN where missing; None: all entries are observed.
+        is_checked: selects forces.
 
     Returns:
-        The times; None if an argument is traced, if fewer than two times are observed, for an observation family, and
+        The list is empty if a value is traced, if fewer than two times are observed, for an observation family, and
         for a model with process noise, which the linearised model does not include.
     """
+    pairs = zip(model.force_names, model.force_list, strict=True)
+    terms = [ForceTerm(name, column, term) for column, (name, force) in enumerate(pairs)
+             for term in (force.forces if isinstance(force, Sum) else (force,))]
+    checked = [index for index, term in enumerate(terms) if is_checked(term.force)]
+    observed = _observed_times(model, times, y) if checked else None
+    linear = None if observed is None else _linearize(model, observed[0])
+    if observed is None or linear is None:
+        return []
+    return [LinearizedTerm(terms[index], terms[:index] + terms[index + 1:], linear, observed) for index in checked]
+
+
+def _observed_times(model: LatentForceModel, times: Any, y: Any) -> np.ndarray | None:
+    """Return the times (N,) with observed entries, None where the linearised model does not give the likelihood."""
     if isinstance(model.observation, ObservationFamily) or model.process_noise is not None:
         return None
     # In compiled code every new array is traced.
@@ -80,7 +96,7 @@ def observed_times(model: LatentForceModel, times: Any, y: Any) -> np.ndarray | 
     return observed if observed.ndim == 1 and observed.size > 1 and np.all(np.isfinite(observed)) else None
 
 
-def linearize(model: LatentForceModel, time: float) -> LinearModel | None:
+def _linearize(model: LatentForceModel, time: float) -> LinearModel | None:
     """Return the model linearised at its prior mean; None if a coefficient is traced or not finite."""
     t = jnp.asarray(time, float)
     x = model.initial_state.mean
@@ -136,14 +152,6 @@ def output_responses(linear: LinearModel, grid: np.ndarray, substeps: int) -> tu
             response.append(output)
             initial.append(linear.c @ start)
     return np.concatenate(response), np.concatenate(initial)
-
-
-def exact_covariance(force: Force, grid: np.ndarray) -> np.ndarray:
-    """Return the exact covariance (J, J) of a force on a grid, zero if there is no closed form."""
-    try:
-        return np.asarray(force.covariance(grid[:, None], grid))
-    except NotImplementedError:
-        return np.zeros((grid.size, grid.size))
 
 
 def error_bound(eigenvalues: np.ndarray, pieces: float = 1.0) -> float:

@@ -1,54 +1,36 @@
-"""Estimates of the error of the log likelihood due to the SDE of a squared exponential force.
+"""Warnings that an approximation of a force is too coarse for the data.
 
-The SDE of order n has the covariance k_n instead of k. For each squared exponential force of a model:
+A squared exponential force is approximated by an SDE, a periodic force by some of its functions
+(`lfm_ppl.model.truncation`). For each squared exponential force of a model:
 
 1. Linearise the model at its prior mean (`lfm_ppl.model.linear_response`).
-2. Replace the observation times by evenly spaced times over a window of at most 20 lengthscales and 150 observed
-   values. Fewer rows with less noise represent dense data; long records consist of independent pieces.
-3. Compute the exact covariance K of the outputs, with noise, initial state and other forces, and the covariance K_n
-   under the SDE.
-4. The eigenvalues of K_n^-1 K give the mean and variance of the error of the log likelihood (`error_bound`).
-5. `check_resolution` warns where the error exceeds `TOLERANCE`, also for truncated periodic forces
-   (`lfm_ppl.model.truncation`).
+2. At each frequency, compute the precision with which an evenly spaced record of the outputs determines the force: the
+   frequency response G of the outputs, against their noise and the spectral densities of the other forces.
+3. `SquaredExponential.approximation_error` gives the error of the log likelihood by frequency.
+
+For records of many lengthscales this is the error of the covariances of the data. For records shorter than a
+lengthscale it is too large: a signal-to-noise ratio of 1e6 in variance then gives a warning too early.
 
 Source: Whittle (1953), Arkiv för Matematik 2.
 """
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lfm_ppl.forces.sde import ApproximationWarning
+from lfm_ppl.forces.sde import ApproximationWarning, Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.linear_response import (
-    LEAST_NOISE,
-    TOLERANCE,
-    ForceTerm,
-    LinearModel,
-    error_bound,
-    exact_covariance,
-    force_terms,
-    linearize,
-    observed_times,
-    output_responses,
-)
+from lfm_ppl.model.linear_response import LEAST_NOISE, TOLERANCE, LinearizedTerm, LinearModel, linearized_terms
 from lfm_ppl.model.truncation import truncation_message, truncations
 
-_WINDOW = 20.0
-"""Length of the window in lengthscales; the pieces of longer records are treated as independent."""
-_FINEST_SPACING = 0.2
-"""Spacing in lengthscales below which several observations are equivalent to one observation with less noise."""
-_INDEPENDENT_SPACING = 10.0
-"""Spacing in lengthscales beyond which observations are independent."""
-_MOST_VALUES = 150
-"""Largest number of observed values in the window; a larger number is represented by these, with less noise."""
-_LONGEST_STEP = 0.25
-"""Longest step in lengthscales over which a force is taken as linear in time."""
+_SPACINGS = (1e-9, 10.0)
+"""Least and largest spacing in lengthscales; beyond the largest one, observations are independent."""
 
 
 @dataclass(frozen=True)
@@ -94,16 +76,7 @@ def resolution_messages(model: LatentForceModel, times: Any, y: Any) -> list[str
 
 
 def resolutions(model: LatentForceModel, times: Any, y: Any = None) -> list[Resolution]:
-    r"""Estimate the error of the log likelihood of data at ``times`` due to each squared exponential force.
-
-    For data y ~ N(0, K) from the exact process, whose covariance is K_n under the SDE, the error of the log likelihood
-    has the moments, with the eigenvalues e_i of K_n^-1 K,
-
-        mean = -sum_i (e_i - 1 - log e_i) / 2,    variance = sum_i (e_i - 1)^2 / 2.
-
-    K belongs to the model linearised at its prior mean, including noise, initial state and other forces, for evenly
-    spaced observations. For records longer than 20 lengthscales, mean and variance are computed over 20 lengthscales
-    and scaled to the full record.
+    """Estimate the error of the log likelihood of data due to each squared exponential force.
 
     Args:
         model: the latent force model.
@@ -111,62 +84,56 @@ def resolutions(model: LatentForceModel, times: Any, y: Any = None) -> list[Reso
         y: (T, D), NaN where missing; None: all entries are observed.
 
     Returns:
-        One entry for each squared exponential force, also in sums. The list is empty if a value is traced, if fewer
-        than two times are observed, and for a model with process noise, which the estimate does not include.
+        One entry for each squared exponential force, where `linearized_terms` describes the model.
     """
-    terms = force_terms(model)
-    if not any(isinstance(force, SquaredExponential) for _, _, force in terms):
-        return []
-    observed = observed_times(model, times, y)
-    linear = None if observed is None else linearize(model, observed[0])
-    if observed is None or linear is None:
-        return []
     results = []
-    for index, (name, column, force) in enumerate(terms):
-        if isinstance(force, SquaredExponential) and np.ndim(force.lengthscale) == np.ndim(force.scale) == 0:
-            other_terms = terms[:index] + terms[index + 1:]
-            with np.errstate(all="ignore"):
-                estimate = _estimate(linear, observed, force, column, other_terms)
-            if estimate is not None:
-                results.append(Resolution(name, force, *estimate))
-    return results
+    for linearized in linearized_terms(model, times, y, _is_checked):
+        with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):
+            results.append(_estimate(linearized))
+    return [result for result in results if np.isfinite(result.error)]
 
 
-def _estimate(linear: LinearModel, times: np.ndarray, force: SquaredExponential, column: int,
-              other_terms: list[ForceTerm]) -> tuple[float, float] | None:
-    """Return the error and the signal-to-noise ratio; None if the numbers overflow."""
-    lengthscale, outputs = float(force.lengthscale), len(linear.c)
-    spacing = min(np.ptp(times) / max(times.size - 1, 1), _INDEPENDENT_SPACING * lengthscale)
-    most_rows = max(4, _MOST_VALUES // outputs)
-    window = min(_WINDOW, most_rows * _FINEST_SPACING) * lengthscale
-    count = min(times.size, 1.0 + max(window, 3.0 * spacing) / spacing) if spacing > 0.0 else times.size
-    pieces = times.size / count
-    points = int(np.ceil(min(count, most_rows)))
-    window = spacing * (count - 1.0)
-    substeps = 1 if points == 1 else max(1, int(np.ceil(window / (points - 1) / (_LONGEST_STEP * lengthscale))))
-    grid = np.linspace(0.0, window, (points - 1) * substeps + 1)
-    response, initial = output_responses(linear, grid, substeps)
+def _is_checked(force: Force) -> bool:
+    return isinstance(force, SquaredExponential) and np.ndim(force.lengthscale) == np.ndim(force.scale) == 0
 
-    def output_covariance(kernel: np.ndarray, source: int) -> np.ndarray:
-        return response[:, :, source] @ kernel @ response[:, :, source].T
 
-    exact_kernel, sde_kernel = force.covariances(grid[:, None] - grid)
-    signal = output_covariance(exact_kernel, column)
-    noise = np.kron(np.eye(points), linear.noise * (points / count))
-    exact = signal + noise + initial @ initial.T
-    for _, other_column, other_force in other_terms:
-        exact = exact + output_covariance(exact_covariance(other_force, grid), other_column)
-    exact = exact + LEAST_NOISE * signal.diagonal().max() * np.eye(len(exact))
+def _estimate(linearized: LinearizedTerm) -> Resolution:
+    """Return the effect of a force; the error is not finite where numbers overflow."""
+    (name, column, force), other_terms, linear, times = linearized
+    assert isinstance(force, SquaredExponential)
+    lengthscale = float(force.lengthscale)
+    spacing = lengthscale * float(np.clip(np.ptp(times) / (times.size - 1) / lengthscale, *_SPACINGS))
+    omega = np.linspace(0.0, 10.0 / lengthscale, 1001)[1:]
+    gain = np.abs(_frequency_response(linear, omega)[:, :, column]) ** 2
+    variances = gain.T @ np.asarray(force.spectral_density(omega)) * omega[0] / np.pi
+    factor = np.linalg.cholesky(linear.noise + LEAST_NOISE * variances.max() * np.eye(len(variances)))
+
+    def precision(omega: np.ndarray) -> np.ndarray:
+        """Return G' (R spacing + sum_o G_o S_o G_o')^-1 G of the force, by the matrix inversion lemma."""
+        white = np.linalg.solve(factor, _frequency_response(linear, omega))
+        gram = np.swapaxes(white.conj(), -1, -2) @ white / spacing
+        densities = np.zeros((*omega.shape, gram.shape[-1]))
+        for _, other_column, other_force in other_terms:
+            densities[..., other_column] += _spectral_density(other_force, omega)
+        information = np.linalg.solve(np.eye(gram.shape[-1]) + gram * densities[..., None, :], gram)
+        return information[..., column, column].real
+
+    error = force.approximation_error(precision, spacing, times.size)
+    return Resolution(name, force, error, float(np.nanmax(variances / linear.noise.diagonal())))
+
+
+def _frequency_response(linear: LinearModel, omega: np.ndarray) -> np.ndarray:
+    """Return C (i omega - A)^-1 B + D, of shape (*omega.shape, D, R)."""
+    resolvent = 1j * omega[..., None, None] * np.eye(len(linear.a)) - linear.a
+    return linear.c @ np.linalg.solve(resolvent, np.broadcast_to(linear.b, (*omega.shape, *linear.b.shape))) + linear.d
+
+
+def _spectral_density(force: Force, omega: np.ndarray) -> np.ndarray:
+    """Return the spectral density of a force, zero if there is no closed form."""
     try:
-        difference = output_covariance(sde_kernel - exact_kernel, column)
-        factor, approximate = (np.linalg.cholesky(m) for m in (exact, exact + difference))
-        ratio = np.linalg.solve(approximate, factor)
-        values = np.linalg.eigvalsh(ratio.T @ ratio)
-    except np.linalg.LinAlgError:
-        return None
-    error = error_bound(values, pieces)
-    variances = signal.diagonal() / np.tile(linear.noise.diagonal(), points)
-    return (error, float(np.nanmax(variances))) if np.isfinite(error) else None
+        return np.asarray(force.spectral_density(omega))
+    except NotImplementedError:
+        return np.zeros(omega.shape)
 
 
 def _message(resolution: Resolution) -> str:

@@ -27,7 +27,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import cholesky, solve_triangular
 
 from lfm_ppl.forces.basis import Eigenfunctions, fourier_coefficients
 from lfm_ppl.forces.quasi_periodic import QuasiPeriodic
@@ -36,12 +36,9 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.linear_response import (
     LEAST_NOISE,
     TOLERANCE,
-    ForceTerm,
-    LinearModel,
+    LinearizedTerm,
     error_bound,
-    force_terms,
-    linearize,
-    observed_times,
+    linearized_terms,
     output_responses,
 )
 
@@ -73,7 +70,7 @@ class Truncation:
         name: name of the force in the model.
         force: the periodic force, perhaps a term of a sum.
         error: estimated error of the log likelihood: |mean| + 2 standard deviations over data sets from the full
-            kernel; or a bound on it that is within the tolerance.
+            kernel.
         functions: least number of functions with an error within the tolerance; None if it is larger than the number
             of functions in the estimate.
     """
@@ -112,26 +109,16 @@ def truncations(model: LatentForceModel, times: Any, y: Any = None) -> list[Trun
         y: (T, D), NaN where missing; None: all entries are observed.
 
     Returns:
-        One entry for each `Periodic` or `QuasiPeriodic` force, also in sums, except those with
-        ``explained_variance=0``, whose functions are the model. The list is empty if a value is traced, if fewer than
-        two times are observed, and for an observation family or process noise.
+        One entry for each `Periodic` or `QuasiPeriodic` force, except those with ``explained_variance=0``, whose
+        functions are the model, where `linearized_terms` describes the model.
     """
-    terms = force_terms(model)
-    if not any(_is_checked(force) for _, _, force in terms):
-        return []
-    observed = observed_times(model, times, y)
-    linear = None if observed is None else linearize(model, observed[0])
-    if observed is None or linear is None:
-        return []
-    initial_time = observed[0] if model.initial_time is None else float(model.initial_time)
     results = []
-    for index, (name, column, force) in enumerate(terms):
-        if isinstance(force, QuasiPeriodic) and _is_checked(force):
-            other_terms = terms[:index] + terms[index + 1:]
-            with np.errstate(all="ignore"):
-                estimate = _estimate(linear, observed, force, column, other_terms, initial_time)
-            if estimate is not None:
-                results.append(Truncation(name, force, *estimate))
+    for linearized in linearized_terms(model, times, y, _is_checked):
+        initial_time = linearized.times[0] if model.initial_time is None else float(model.initial_time)
+        with np.errstate(all="ignore"):
+            estimate = _estimate(linearized, initial_time)
+        if estimate is not None:
+            results.append(estimate)
     return results
 
 
@@ -151,12 +138,11 @@ def _is_checked(force: Force) -> bool:
     return isinstance(force, QuasiPeriodic) and force.explained_variance > 0.0 and np.ndim(force.period) == 0
 
 
-def _estimate(linear: LinearModel, times: np.ndarray, force: QuasiPeriodic, column: int,
-              other_terms: list[ForceTerm], initial_time: float) -> tuple[float, int | None] | None:
-    """Return the error and the sufficient number of functions; None if the numbers overflow."""
+def _estimate(linearized: LinearizedTerm, initial_time: float) -> Truncation | None:
+    """Return the effect of a truncation; None if the numbers overflow."""
+    (name, column, force), other_terms, linear, times = linearized
+    assert isinstance(force, QuasiPeriodic)
     is_direct = not (np.any(linear.c) and np.any(linear.b))
-    if is_direct and (bound := _trace_bound(linear, times, force, column, initial_time)) <= TOLERANCE:
-        return bound, force.functions
     rows = _representative_rows(times, force, initial_time, len(linear.c), is_direct)
     if rows is None:
         return None
@@ -177,11 +163,9 @@ def _estimate(linear: LinearModel, times: np.ndarray, force: QuasiPeriodic, colu
     for _, other_column, other_force in other_terms:
         exact = exact + output_covariance(_covariance(other_force, grid, initial_time), other_column)
     exact = exact + LEAST_NOISE * signal.diagonal().max() * np.eye(len(exact))
-    if not np.all(np.isfinite(exact)):
-        return None
     try:
-        factor = np.linalg.cholesky(exact)
-    except np.linalg.LinAlgError:
+        factor = cholesky(exact, lower=True)
+    except (ValueError, np.linalg.LinAlgError):  # not finite, or not positive definite
         return None
 
     def whitened(functions: int) -> np.ndarray:
@@ -191,41 +175,18 @@ def _estimate(linear: LinearModel, times: np.ndarray, force: QuasiPeriodic, colu
         return solve_triangular(factor, half.T, lower=True)
 
     def second_order_error(functions: int) -> float:
-        return _second_order_error(rows.pieces * float((whitened(functions) ** 2).sum()))
+        """Return the error for small w_i from the sum of their squares, which is much cheaper than the eigenvalues."""
+        square = rows.pieces * float((whitened(functions) ** 2).sum())
+        return 0.25 * square + 2.0 * float(np.sqrt(0.5 * square))
 
     error = second_order_error(force.functions)
     if not np.isfinite(error):
         return None
     if error <= TOLERANCE:
-        return error, force.functions
+        return Truncation(name, force, error, force.functions)
     values = np.minimum(np.linalg.eigvalsh(whitened(force.functions)), _LARGEST_EIGENVALUE)
-    return (error_bound(1.0 / (1.0 - values), rows.pieces),
-            _least_functions(lambda functions: second_order_error(functions) <= TOLERANCE, force, features.shape[1]))
-
-
-def _second_order_error(square: float) -> float:
-    """Return the error for small w_i from the sum of their squares, which is much cheaper than the eigenvalues."""
-    return 0.25 * square + 2.0 * float(np.sqrt(0.5 * square))
-
-
-def _trace_bound(linear: LinearModel, times: np.ndarray, force: QuasiPeriodic, column: int,
-                 initial_time: float) -> float:
-    """Return a cheap bound on the error for a force that is observed directly; infinite if there is no bound.
-
-    K is at least the noise covariance, so that sum_i |w_i| is at most the trace of K - K_J relative to the noise.
-    """
-    if not force.kernel.stationary:
-        return np.inf
-    start = force.kernel.start
-    omitted_variance = max(float(force.kernel(start, start)) - float(force.eigenvalues().sum()), 0.0)
-    evolution_variances = _covariance(force.evolution, times[[0, -1]], initial_time).diagonal()
-    gain = linear.d[:, column]
-    try:
-        signal_to_noise = float(gain @ np.linalg.solve(linear.noise, gain))
-    except np.linalg.LinAlgError:
-        return np.inf
-    trace = times.size * omitted_variance * evolution_variances.max() * signal_to_noise
-    return _second_order_error(trace**2) if np.isfinite(trace) else np.inf
+    return Truncation(name, force, error_bound(1.0 / (1.0 - values), rows.pieces), _least_functions(
+        lambda functions: second_order_error(functions) <= TOLERANCE, force, features.shape[1]))
 
 
 def _least_functions(is_sufficient: Callable[[int], bool], force: QuasiPeriodic, most: int) -> int | None:
