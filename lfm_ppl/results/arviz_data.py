@@ -242,8 +242,8 @@ def summary(result: Any) -> pd.DataFrame:
         result: an ArviZ object with a posterior.
 
     Returns:
-        Columns mean, sd, q2.5, q97.5 (quantiles in percent), mcse_mean, ess_bulk, ess_tail, r_hat;
-        rows labelled ``noise_sd`` or ``decay[CDKN1A]``. Resampled draws are no chains: the effective size is that of
+        Columns mean, sd, q2.5, q97.5 (quantiles in percent), truth (where a result has it), mcse_mean, ess_bulk,
+        ess_tail, r_hat; rows labelled ``noise_sd`` or ``decay[CDKN1A]``. Resampled draws are no chains: the effective size is that of
         the importance weights, and there is no R-hat. Draws of a Laplace approximation (sampler "map") are independent:
         the columns are mode, mean, sd, q2.5, q97.5, and ``warnings`` where the mode of a parameter is degenerate. A run
         that was stopped has a column more, ``partial``, which says what there is.
@@ -267,6 +267,8 @@ def summary(result: Any) -> pd.DataFrame:
         "q2.5": {label: low for label, (low, _) in quantiles.items()},
         "q97.5": {label: high for label, (_, high) in quantiles.items()},
     }
+    if has_group(result, "truth") and (truth := scalar_truth(group(result, "posterior"), group(result, "truth"))):
+        moments["truth"] = truth
     if of_mode(result):
         table = pd.DataFrame({**_mode(result), **moments}, index=list(draws), dtype=float)
         if degenerate := _degenerate(result):
