@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     if entry is None:
         print(f"{listed('')}\n\n`lfm-ppl compare NAME` runs a study; `--quick` is a short run of a few minutes.")
         return 0
-    from lfm_ppl.results import tables, web_page
+    from lfm_ppl.results import html_report, tables
     from lfm_ppl.utils.progress import Console, duration
 
     report = None if arguments.quiet else Console()
@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = study.settings.from_command_line(report, arguments.quick, **study_options.given_settings(arguments))
     default = Path("lfm-results") / "compare" / (f"{entry.name}-quick" if arguments.quick else entry.name)
     with results.lasting(default, arguments.out) as folder:
-        web_page.refuse_foreign(folder / PAGE, arguments.overwrite)
+        html_report.refuse_foreign(folder / PAGE, arguments.overwrite)
         start_time = time.perf_counter()
         study_result = study.run(settings, folder, overwrite=arguments.overwrite, report=report, workers=workers)
         written = study.save(study_result, folder)
@@ -50,22 +50,16 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _index(folder: Path, entry: CatalogueEntry, study_result: StudyResult, written: list[Path], command: str) -> Path:
     """Write the tables and figures of a study as one page."""
-    from lfm_ppl.results import tables, web_page
-    from lfm_ppl.results.web_page import Section
+    from lfm_ppl.results import html_report
 
     existing_files = [path for path in written if path.is_file()]
-    relative_paths = [path.relative_to(folder).as_posix() for path in existing_files if path.is_relative_to(folder)]
-    sections = [
-        Section("tables", "Tables", "\n".join(web_page.heading(title) + tables.html_table(table)
-                                              for title, table in study_result.printed.items())),
-        Section("notes", "Notes", "\n".join(web_page.paragraph(note) for note in study_result.notes)),
-        Section("figures", "Figures", "\n".join(web_page.picture(path.read_bytes(), path.stem)
-                                                for path in existing_files if path.suffix == ".png")),
-        Section("repeat", "How to repeat it", web_page.preformatted(command) + web_page.paragraph(
-            "Stored results of the folder are not computed again; in another folder (--out) everything is.", "note")),
-        Section("files", "Files", web_page.file_list(relative_paths)),
-    ]
-    return web_page.write(web_page.render(entry.name, entry.summary, sections), folder / PAGE, overwrite=True)
+    return html_report.write_page(
+        folder / PAGE, True, entry.name, entry.summary,
+        {path.stem: path.read_bytes() for path in existing_files if path.suffix == ".png"},
+        tables=study_result.printed, notes=study_result.notes,
+        repeat={"commands": [command], "note": "Stored results of the folder are not computed again; in another folder "
+                                               "(--out) everything is."},
+        files=[path.relative_to(folder).as_posix() for path in existing_files if path.is_relative_to(folder)])
 
 
 def listed(indent: str = "  ") -> str:

@@ -19,9 +19,9 @@ def command_line(arguments: argparse.Namespace) -> str:
 
 def refuse_foreign(folder: Path, overwrite: bool) -> None:
     """Raise FileExistsError for a ``report.html`` of another program; a report of lfm_ppl is replaced."""
-    from lfm_ppl.results import html_report, web_page
+    from lfm_ppl.results import html_report
 
-    web_page.refuse_foreign(folder / html_report.NAME, overwrite)
+    html_report.refuse_foreign(folder / html_report.NAME, overwrite)
 
 
 def exists(folder: Path) -> bool:

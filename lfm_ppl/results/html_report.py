@@ -1,100 +1,79 @@
 """The report of a result, ``report.html``: one page without network access or scripts.
 
-1. Collect the sections from the groups and attributes of a result: model, data, fit, table, figures, settings.
-2. Draw the figures, or use the files that exist.
-3. Render the page (`lfm_ppl.results.web_page`), and write it atomically.
+1. Collect the values of each section from the groups and attributes of a result; a section without values is left out.
+2. Draw the figures, or read files.
+3. Fill in the template ``report.html.jinja``, and write the page atomically.
 """
 
 from __future__ import annotations
 
+import base64
+import functools
 import io
 import json
 import re
 import shlex
+import textwrap
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
+from jinja2 import Environment, StrictUndefined, Template
+from markupsafe import Markup
 
-from lfm_ppl.results import arviz_data, predictions, report, tables, web_page
+from lfm_ppl.results import arviz_data, predictions, report, tables
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import ORIGIN, input_unit, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import saving, style
 from lfm_ppl.results.residuals import misfit
 from lfm_ppl.results.scalars import unit_of
-from lfm_ppl.results.web_page import Section
 from lfm_ppl.utils import calendar_time
+from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
 
 NAME = "report.html"
 
-COMMAND = "command_line"
-"""Attribute of a result, and of its groups accuracy and predictions: the command that made it."""
+_GENERATOR = '<meta name="generator" content="lfm_ppl">'
 
-CALL, DESCRIPTION = "call", "description"
-"""Attributes of a result: the call in Python that made it, and the docstring of the model."""
-
-PRIORS, MEANINGS, ASSUMPTIONS = "priors", "meanings", "assumptions"
-"""Attributes of a result, as JSON: name -> prior in words; what the model file says of a parameter; and what the model
-says of its observations, forces and initial state."""
+_LONG_TEXT = 50
+"""Number of characters of a cell from which on it is broken into lines."""
 
 _MOST_TIMES = 40
-"""Times of a forecast that are listed; more are thinned evenly."""
+"""Number of times of a forecast that are listed; more are thinned evenly."""
 
 _MOST_SERIES = 5
-"""Series of a panel that a forecast is listed of."""
+"""Number of series of a panel whose forecast is listed."""
 
-_CAPTIONS = {
-    "fit": "Data and fit: posterior mean, 95% of the noise-free output and of new data", "inputs": "Known inputs",
-    "forces": "Latent forces",
-    "deterministics": "What follows from states and forces", "states": "States", "trace": "Chains",
-    "pairs": "Pairs of parameters", "residuals": "Residuals one step ahead",
-    "accuracy": "What the exact likelihood would change", "forecast": "Forecast with its noise",
-    "forecast-inputs": "Known inputs of the forecast", "forecast-forces": "Forecast of the latent forces",
-    "forecast-deterministics": "Forecast of what follows from states and forces",
-    "forecast-states": "Forecast of the states",
-}
+_DIAGNOSTICS = ["mcse_mean", "ess_bulk", "ess_tail", "r_hat"]
 
-_SETTINGS = {
-    "sampler": "sampler", "chains": "chains", "warmup": "warm-up steps", "samples": "draws a chain",
-    "thin": "steps a draw", "seed": "seed", "rule": "rule", "steps": "integration steps", "max_step": "longest step",
-    "tolerance": "tolerance of a step (sd)", "iterations": "iterations", "likelihood": "likelihood",
-    "sites": "observation family",
-    "fixed": "fixed", "options": "options",
-    "constraints": "constraints",
-    "particles": "particles", "log_likelihood_sd": "sd of the log likelihood", "delayed": "delayed acceptance",
-    "effective_draws": "effective draws", "map_message": "optimiser",
-    "map_log_density": "log density at the mode", "log_evidence": "log evidence (Laplace)",
-    "wall_time_s": "time (s)", "created_at": "made at",
-}
-_ELSEWHERE = ("model", "model_file", DESCRIPTION, "data", "note", "versions", "warnings", "partial", "settings", "run",
-              "map_converged", arviz_data.MODE, COMMAND, CALL, ORIGIN, PRIORS, MEANINGS, ASSUMPTIONS,
-              "inference_library", "site_failures", "constraint_weights", arviz_data.DEGENERATE)
-"""Attributes that stand in other sections, or that nobody needs to read."""
+_NOT_SETTINGS = ("model", "model_file", "description", "data", "note", "warnings", "partial", "settings", "run",
+                 "map_converged", arviz_data.MODE, "command_line", "call", ORIGIN, "priors", "meanings", "assumptions",
+                 "inference_library", arviz_data.SITES, arviz_data.WEIGHTS, arviz_data.DEGENERATE)
+"""Attributes that stand in other sections, or that only programs read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"
                     r"|(forecast-)?(fit|inputs|forces|deterministics|states|trace|pairs|residuals|accuracy|forecast)"
                     r"(-\d+)?\.(png|pdf|svg))")
-"""Files of a result; what else lies in a folder is nobody's business."""
+"""Files of a result; other files in a folder are not linked."""
 
 
 def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figures: Sequence[str | Path] | None = None,
                 more: Mapping[str, pd.DataFrame] | None = None) -> Path:
     """Write a result as one HTML page that needs nothing but itself: no network, no script, no other file.
 
-    It holds the model with its docstring, settings and versions, the data, the summary with its warnings, the verdict
-    of the accuracy check and the forecast where the result has them, the figures, how to do it again, and links to the
-    files of the result that lie beside the page. All text is escaped. It reads in light and dark, on a phone and on
-    paper.
+    It begins with the warnings, the forces, the fit and the table of the parameters. The forecast and the verdict of the
+    accuracy check, where the result has them, and further figures follow. Model, data, settings, commands and links to
+    the files beside the page come last. All text is escaped. It reads in light and dark, on a phone and on paper.
 
     Args:
         result: of `lfm_ppl.fit`, `lfm_ppl.to_arviz` or `lfm_ppl.forecast`, or read by `lfm_ppl.load`.
         path: the file to write, or a folder, in which it is ``report.html``.
         overwrite: replace a file that exists.
         figures: PNG files to show, as `lfm_ppl.results.plots.save_figures` wrote them; None: all that the result has
-            the numbers for are drawn. One that cannot be drawn is named on the page, which is written all the same.
+            the numbers for are drawn. A figure that cannot be drawn is named on the page.
         more: title -> table, shown after the forecast: scores, for instance.
 
     Returns:
@@ -115,102 +94,148 @@ def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figur
         ('report.html', True)
     """
     path = Path(path) / NAME if Path(path).is_dir() else Path(path)
-    web_page.refuse_existing(path, overwrite)
+    refuse_existing(path, overwrite)
     attrs = arviz_data.attributes(result)
-    description = str(attrs.get(DESCRIPTION, "")).strip()
-    sections = [
-        Section("result", "Result", _state(result, attrs)),
-        Section("model", "Model", _model(attrs, description)),
-        Section("data", "Data", _data(result, attrs)),
-        Section("summary", "Parameters", _summary(result)),
-        Section("accuracy", "Accuracy", _accuracy(result, path.parent)),
-        Section("forecast", "Forecast", _forecast(result, more or {})),
-        Section("figures", "Figures", _draw_figures(result) if figures is None else _read(figures)),
-        Section("settings", "Settings", _settings(attrs)),
-        Section("repeat", "How to repeat it", _repeat(result, attrs)),
-        Section("files", "Files", _files(path)),
-    ]
-    lead = description.partition("\n")[0]
-    return web_page.write(web_page.render(str(attrs.get("model", "model")), lead, sections), path, overwrite)
+    table = tables.annotated(arviz_data.summary(result), result)
+    pictures, failures = _drawn(result) if figures is None else (_read(figures), [])
+    diagnostics = [name for name in _DIAGNOSTICS if name in table]
+    description = str(attrs.get("description", "")).strip()
+    has_accuracy = arviz_data.has_group(result, report.GROUP)
+    return write_page(
+        path, overwrite, str(attrs.get("model", "model")), description.partition("\n")[0], pictures,
+        result={"partial": attrs.get("partial"), "messages": arviz_data.convergence_warnings(result),
+                "misfit": misfit(result), "is_mode": arviz_data.of_mode(result), "table": _short(table, result),
+                "is_weighted": "effective_draws" in attrs},
+        forecast=_forecast(result, more or {}),
+        accuracy=_accuracy(result, path.parent) if has_accuracy else {"is_constrained": "constraints" in attrs},
+        failures=failures, convergence=table[diagnostics] if diagnostics and len(table) else None,
+        model={"name": attrs.get("model"), "file": attrs.get("model_file"), "paragraphs": _paragraphs(description),
+               "priors": _priors(attrs), "assumptions": json.loads(str(attrs.get("assumptions", "{}")))},
+        data=_data(result, attrs) if arviz_data.has_group(result, "observed_data") else {},
+        settings={name: text for name, value in attrs.items()
+                  if name not in _NOT_SETTINGS and (text := _plain(value))} or None,
+        repeat={"commands": _commands(result, attrs), "note": ""}, files=_files(path) or None)
 
 
-def _state(result: Any, attrs: Mapping[str, Any]) -> str:
-    """Say in a glance what there is: whether it is whole, and what is wrong with it."""
-    html = ""
-    if (partial := attrs.get("partial")) is not None:
-        html += web_page.warnings([f"This result is partial: {partial}."])
-    messages = arviz_data.convergence_warnings(result)
-    html += web_page.warnings([*messages, *misfit(result)])
-    if not messages:
-        html += web_page.paragraph("The draws are of a Laplace approximation at the posterior mode, not of chains."
-                                    if arviz_data.of_mode(result) else
-                                    "The draws are weighted ones; how many they are worth stands in the table."
-                                    if "effective_draws" in attrs else
-                                    "The chains agree, and are long enough: the draws represent the posterior of "
-                                    "this model. Whether the model fits the data, the residuals tell.")
-    if arviz_data.has_group(result, report.GROUP):
-        html += web_page.paragraph(f"Accuracy: {report.AccuracyReport.of(result).verdict.word}.")
-    return html
+def write_page(path: str | Path, overwrite: bool, title: str, lead: str, pictures: Mapping[str, bytes],
+               **sections: Any) -> Path:
+    """Write a page, atomically, and return its path.
+
+    Args:
+        path: the file.
+        overwrite: replace a file that exists.
+        title: of the page.
+        lead: a line below it; empty for none.
+        pictures: name -> PNG.
+        **sections: anchor of a section of the template -> its values; None leaves the section out.
+
+    Raises:
+        FileExistsError: ``path`` exists and ``overwrite`` is False.
+    """
+    figures = [{"name": name, "kind": re.sub(r"-\d+$", "", name), "png": png} for name, png in pictures.items()]
+    page = _template().render(title=title, lead=lead, figures=figures, sections={
+        anchor: values for anchor, values in sections.items() if values is not None})
+    with atomic_write(path, overwrite) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return Path(path)
 
 
-def _model(attrs: Mapping[str, Any], description: str) -> str:
-    file = str(attrs.get("model_file", ""))
-    name = str(attrs.get("model", "model"))
-    html = web_page.facts([("name", name), *([("file", file)] if file not in ("", name) else [])])
-    html += (web_page.prose(description) if description else web_page.paragraph(
-        "The model has no docstring; what stands in one would be shown here.", "note"))
-    if assumed := json.loads(str(attrs.get(ASSUMPTIONS, "{}"))):
-        html += web_page.heading("Assumptions") + web_page.facts(list(assumed.items())) + web_page.paragraph(
-            "Numbers that depend on parameters belong to one set of values typical of the prior, not of the "
-            "posterior.", "note")
-    priors = json.loads(str(attrs.get(PRIORS, "{}")))
-    if not priors:
-        return html
-    meanings = json.loads(str(attrs.get(MEANINGS, "{}")))
-    table = pd.DataFrame({"prior": priors} | ({"meaning": {name: meanings.get(name, "") for name in priors}}
-                                               if any(meanings.get(name) for name in priors) else {}))
-    html += web_page.heading("Priors") + web_page.paragraph(
-        "Where a prior depends on another parameter, its numbers are those at one value of it.", "note")
-    return html + tables.html_table(table, index_label="parameter")
+def refuse_foreign(path: str | Path, overwrite: bool) -> None:
+    """Raise FileExistsError for a file of another program that may not be replaced; a page of lfm_ppl may be."""
+    path = Path(path)
+    is_generated = path.is_file() and _GENERATOR in path.read_text(encoding="utf-8", errors="replace")[:500]
+    refuse_existing(path, overwrite or is_generated)
 
 
-def _data(result: Any, attrs: Mapping[str, Any]) -> str:
-    if not arviz_data.has_group(result, "observed_data"):
-        return web_page.paragraph("The result holds no data.", "note")
+@functools.cache
+def _template() -> Template:
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
+    environment.filters |= {"readable": tables.readable, "column_kinds": _column_kinds,
+                            "base64": lambda png: base64.b64encode(png).decode("ascii")}
+    return environment.from_string(resources.files("lfm_ppl.results").joinpath("report.html.jinja").read_text("utf-8"))
+
+
+def _column_kinds(frame: pd.DataFrame) -> list[tuple[str, str]]:
+    """Return the name of each column with its HTML class: ``n`` of numbers, ``t`` of text in several lines."""
+    return [(str(name), Markup(' class="n"') if pd.api.types.is_numeric_dtype(column) else
+             Markup(' class="t"') if column.astype(str).str.len().max() > _LONG_TEXT else "")
+            for name, column in frame.items()]
+
+
+def _drawn(result: Any) -> tuple[dict[str, bytes], list[str]]:
+    """Return the figures of a result, name -> PNG, and a message for each that could not be drawn."""
+    pictures, failures = {}, []
+    for name, draw, names in saving.pages_of(result, "full"):
+        try:
+            figure = draw(result, names, width="full")
+            with style.in_style(), io.BytesIO() as buffer:
+                figure.savefig(buffer, format="png")
+                pictures[name] = buffer.getvalue()
+        except Exception as error:  # the page is worth having without it
+            failures.append(f"The figure {name} could not be drawn: {error}")
+    return pictures, failures
+
+
+def _read(figures: Sequence[str | Path]) -> dict[str, bytes]:
+    return {Path(path).stem: Path(path).read_bytes() for path in figures}
+
+
+def _short(table: pd.DataFrame, result: Any) -> pd.DataFrame:
+    """Return the table of the parameters without diagnostics; warnings on all of them stand above it."""
+    if table.empty:
+        return table
+    messages = {label: arviz_data.convergence_warnings(result, table.loc[[label]]) for label in table.index}
+    shared = set.intersection(*map(set, messages.values()))
+    rows = ["; ".join(message.partition(": ")[0] for message in messages[label] if message not in shared)
+            for label in table.index]
+    table = table.drop(columns=[*_DIAGNOSTICS, "partial", "warnings"], errors="ignore")
+    return table.assign(warnings=rows) if any(rows) else table
+
+
+def _priors(attrs: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the prior of each parameter in words, and its meaning where the model file tells it."""
+    priors, meanings = (json.loads(str(attrs.get(name, "{}"))) for name in ("priors", "meanings"))
+    table = pd.DataFrame({"prior": priors}, dtype=object)
+    return table.assign(meaning=[meanings.get(name, "") for name in table.index]) if any(meanings.values()) else table
+
+
+def _paragraphs(text: str) -> list[tuple[bool, str]]:
+    r"""Return the paragraphs of a docstring, and whether each is indented, such as an equation.
+
+    Example:
+        >>> _paragraphs("A spring\nand a mass.\n\n    dx/dt = v")
+        [(False, 'A spring and a mass.'), (True, 'dx/dt = v')]
+    """
+    blocks = [block for block in re.split(r"\n(?:[ \t]*\n)+", text.strip("\n")) if block.strip()]
+    return [(True, textwrap.dedent(block).rstrip()) if any(line[:1].isspace() for line in block.splitlines())
+            else (False, " ".join(block.split())) for block in blocks]
+
+
+def _data(result: Any, attrs: Mapping[str, Any]) -> dict[str, Any]:
     dataset = arviz_data.group(result, "observed_data")
     name = next(str(label) for label in dataset.data_vars if label != "times")
-    variable = dataset[name]
+    variable, origin = dataset[name], _origin(result)
     times = np.asarray((dataset["times"] if "times" in dataset else dataset["time"]).values, float)
-    lines = [("source", str(attrs["data"]))] if "data" in attrs else []
-    if "series" in variable.dims:
-        lines.append(("series", str(variable.sizes["series"])))
-    missing = int(variable.isnull().sum())
-    lines += [("rows", str(variable.sizes["time"])), ("missing", f"{missing} of {variable.size} values"),
-              ("times", _span(times, result))]
-    if origin := _origin(result):
-        lines.append(("time 0", calendar_time.clock(0.0, origin, time_unit(result))))
-    if attrs.get("note"):
-        lines.append(("note", str(attrs["note"])))
-    html = web_page.facts(lines)
     names = [str(output) for output in variable["output"].values] if "output" in variable.coords else [name]
-    columns = np.asarray(variable.values, float).reshape(-1, len(names))
-    html += tables.html_table(pd.DataFrame([_described(column, unit_of(variable, output)) for output, column in zip(
-        names, columns.T, strict=True)], names), index_label="output")
+    columns = np.asarray(variable.values, float).reshape(-1, len(names)).T
     inputs = inputs_of(result)
-    if inputs:
-        rows = [{"interpolation": table.interpolation, "times": _span(np.asarray(table.times), result),
-                 **_described(np.asarray(table.values, float), input_unit(result, name))}
-                for name, table in inputs.items()]
-        html += web_page.heading("Known inputs") + tables.html_table(
-            pd.DataFrame(rows, list(inputs)), index_label="input")
-    return html
+    facts = {"source": attrs.get("data"), "series": variable.sizes.get("series"), "rows": variable.sizes["time"],
+             "missing": f"{int(variable.isnull().sum())} of {variable.size} values", "times": _span(times, result),
+             "time 0": calendar_time.clock(0.0, origin, time_unit(result)) if origin else None,
+             "note": attrs.get("note")}
+    described = [_described(np.asarray(table.values, float), input_unit(result, label))
+                 | {"interpolation": table.interpolation, "times": _span(np.asarray(table.times), result)}
+                 for label, table in inputs.items()]
+    return {"facts": {label: text for label, text in facts.items() if text is not None},
+            "outputs": pd.DataFrame([_described(column, unit_of(variable, label))
+                                     for label, column in zip(names, columns, strict=True)], names),
+            "inputs": pd.DataFrame(described, list(inputs))}
 
 
 def _described(values: np.ndarray, unit: str) -> dict[str, Any]:
-    seen = values[np.isfinite(values)]
-    low, mean, high = (seen.min(), seen.mean(), seen.max()) if seen.size else (np.nan,) * 3
-    return {"unit": unit, "values": int(seen.size), "missing": int(np.isnan(values).sum()), "min": float(low),
-            "mean": float(mean), "max": float(high)}
+    column = pd.Series(values.ravel())
+    return {"unit": unit, "values": int(column.count()), "missing": int(column.isna().sum()), "min": column.min(),
+            "mean": column.mean(), "max": column.max()}
 
 
 def _span(times: np.ndarray, result: Any) -> str:
@@ -230,109 +255,41 @@ def _origin(result: Any) -> str:
     return time_origin(result) if time_unit(result) in calendar_time.SECONDS else ""
 
 
-def _summary(result: Any) -> str:
-    table = arviz_data.summary(result)
-    if table.empty:
-        return web_page.paragraph("The model has no parameters that are sampled.", "note")
-    kind = tables.annotated(table, result)["kind"]
-    messages = {label: arviz_data.convergence_warnings(result, table.loc[[label]]) for label in table.index}
-    # What concerns all of them, and what to do about it, stands at the top of the page.
-    shared = set.intersection(*map(set, messages.values()))
-    row_messages = ["; ".join(message.partition(": ")[0] for message in messages[label] if message not in shared)
-                    for label in table.index]
-    columns = {"warnings": row_messages} if any(row_messages) else {}
-    table = table.drop(columns="partial", errors="ignore").assign(kind=kind, **columns)
-    return tables.html_table(table, index_label="parameter")
-
-
-def _accuracy(result: Any, folder: Path) -> str:
-    if "constraints" in arviz_data.attributes(result):
-        return web_page.paragraph("What the approximation of the likelihood does to this posterior cannot be measured: "
-                                  "no reference knows constraints.", "note")
-    if not arviz_data.has_group(result, report.GROUP):
-        return web_page.paragraph("What the approximation of the likelihood does to this posterior has not been "
-                                  "measured yet; lfm-ppl check, or lfm.check_accuracy, measures it.", "note")
+def _accuracy(result: Any, folder: Path) -> dict[str, Any]:
     checked = report.AccuracyReport.of(result)
-    word, reason, command, remedies = checked.verdict
-    lines = [("verdict", f"{word}: {reason}")]
+    verdict, remedies = checked.verdict, list(checked.verdict.remedies)
     path = shlex.quote(str(folder)) if (folder / POSTERIOR).is_file() else "RESULT"
-    if len(remedies) > 1:
-        lines += [(f"remedy {number}", remedy.replace("RESULT", path)) for number, remedy in enumerate(remedies, 1)]
-    elif command:
-        lines.append(("next", command.replace("RESULT", path)))
-    return web_page.facts([*lines, *checked.numbers()]) + tables.html_table(
-        checked.table[list(report.SHOWN)], index_label="parameter")
+    if len(remedies) < 2:
+        remedies = [verdict.command] if verdict.command else []
+    return {"verdict": verdict, "remedies": [remedy.replace("RESULT", path) for remedy in remedies],
+            "facts": dict(checked.numbers()), "table": checked.table[list(report.SHOWN)]}
 
 
-def _forecast(result: Any, more: Mapping[str, pd.DataFrame]) -> str:
-    html = ""
-    if arviz_data.has_group(result, predictions.GROUP):
-        dataset = arviz_data.group(result, predictions.GROUP)
-        if "series" in dataset.dims:
-            for index in range(min(dataset.sizes["series"], _MOST_SERIES)):
-                series = dataset.isel(series=index)
-                label = series["series"].item() if "series" in series.coords else index
-                html += web_page.heading(f"Series {label}") + _forecast_of(series, result)
-            if dataset.sizes["series"] > _MOST_SERIES:
-                html += web_page.paragraph(f"The first {_MOST_SERIES} of {dataset.sizes['series']} series.", "note")
-        else:
-            html = _forecast_of(dataset, result)
-    return html + "".join(web_page.heading(title) + tables.html_table(table) for title, table in more.items())
-
-
-def _forecast_of(dataset: xr.Dataset, result: Any) -> str:
-    """Return the table of what is predicted, after the data where any of it is."""
-    times = np.asarray(dataset["time"].values, float)
+def _forecast(result: Any, more: Mapping[str, pd.DataFrame]) -> dict[str, Any] | None:
+    """Return tables of the predictions, after the data where any of them are."""
+    if not arviz_data.has_group(result, predictions.GROUP):
+        return {"tables": more, "label": "", "count": 0, "most_series": 0, "total": 0} if more else None
+    dataset = arviz_data.group(result, predictions.GROUP)
+    times, unit, origin = np.asarray(dataset["time"].values, float), time_unit(result), _origin(result)
     later = np.flatnonzero(times > dataset.attrs.get("last_observation", np.inf))
     index = later if later.size else np.arange(times.size)
     thinned = index[np.unique(np.linspace(0, index.size - 1, _MOST_TIMES).round().astype(int))]
-    table = predictions.summary(dataset.isel(time=thinned))
-    unit, origin = time_unit(result), _origin(result)
-    labels = [calendar_time.clock(float(time), origin, unit) if origin else f"{time:.10g}" for time in table.index]
-    html = tables.html_table(table.set_axis(labels), index_label=f"time ({unit})" if unit and not origin else "time")
-    period = "after the last observation" if later.size else "of the prediction"
-    shown_times = f"{thinned.size} of {index.size} times" if thinned.size < index.size else "All times"
-    return html + web_page.paragraph(
-        f"{shown_times} {period}. Mean, sd and quantiles (in percent) are of new data, with their noise, and then of "
-        f"the {predictions.NOISE_FREE}.", "note")
 
+    def table(series: xr.Dataset) -> pd.DataFrame:
+        frame = predictions.summary(series.isel(time=thinned))
+        return frame.set_axis([calendar_time.clock(float(time), origin, unit) if origin else f"{time:.10g}"
+                               for time in frame.index])
 
-def _draw_figures(result: Any) -> str:
-    figures, failed = [], []
-    for name, draw, names in saving.pages_of(result, "full"):
-        try:
-            figure = draw(result, names, width="full")
-            with style.in_style(), io.BytesIO() as buffer:
-                figure.savefig(buffer, format="png")
-                figures.append(web_page.picture(buffer.getvalue(), _caption(name)))
-        except Exception as error:  # the page is worth having without it
-            failed.append(f"The figure {name} could not be drawn: {error}")
-    return web_page.warnings(failed) + "\n".join(figures)
-
-
-def _read(figures: Sequence[str | Path]) -> str:
-    if not figures:
-        return web_page.paragraph("No figures were drawn; `lfm-ppl plot` draws them from the result.", "note")
-    return "\n".join(web_page.picture(Path(path).read_bytes(), _caption(Path(path).stem)) for path in figures)
-
-
-def _caption(name: str) -> str:
-    if name in _CAPTIONS:
-        return _CAPTIONS[name]
-    kind, _, page = name.partition("-")
-    return _CAPTIONS.get(kind, kind) + (f", page {page}" if page else "")
-
-
-def _settings(attrs: Mapping[str, Any]) -> str:
-    lines = [(label, text) for name, label in _SETTINGS.items() if (text := _plain(attrs.get(name)))]
-    lines += [(name, text) for name, value in attrs.items()
-              if name not in _SETTINGS and name not in _ELSEWHERE and (text := _plain(value))]
-    versions = _plain(attrs.get("versions"))
-    return web_page.facts([*lines, *([("versions", versions)] if versions else [])])
+    count = dataset.sizes.get("series", 0)
+    names = dataset["series"].values if "series" in dataset.coords else range(count)
+    series = {f"Series {name}": table(dataset.isel(series=number)) for number, name in enumerate(names[:_MOST_SERIES])}
+    return {"tables": (series or {"": table(dataset)}) | dict(more), "label": f"time ({unit})" if unit and not origin
+            else "time", "is_later": later.size > 0, "shown": thinned.size, "total": index.size, "count": count,
+            "most_series": _MOST_SERIES}
 
 
 def _plain(value: Any) -> str:
-    """Return an attribute as text: JSON objects by their entries, nothing for what is empty."""
+    """Return an attribute as text: JSON objects by their entries, nothing for empty values."""
     if isinstance(value, str) and value.startswith(("{", "[")):
         try:
             value = json.loads(value)
@@ -340,34 +297,24 @@ def _plain(value: Any) -> str:
             return value
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {_plain(item)}" for name, item in value.items())
-    if value is None or isinstance(value, (list, tuple)) and not value:
-        return ""
-    return tables.format_number(value, 4)
+    return "" if value is None or isinstance(value, (list, tuple)) and not value else tables.format_number(value, 4)
 
 
-def _repeat(result: Any, attrs: Mapping[str, Any]) -> str:
-    """Return what to type for the same numbers, in the order in which it was typed."""
-    commands = [str(attrs[COMMAND])] if COMMAND in attrs else []
-    groups = [name for name in (report.GROUP, predictions.GROUP) if arviz_data.has_group(result, name)]
-    group_commands = [arviz_data.group(result, name).attrs.get(COMMAND) for name in groups]
-    commands += [str(command) for command in group_commands if command]
-    html = web_page.preformatted("\n".join(commands)) if commands else ""
-    if CALL in attrs and COMMAND not in attrs:
-        lines = [str(attrs[CALL])]
-        if "effective_draws" in attrs:
-            lines += ["lfm.check_accuracy(result, model)", "result = lfm.correct_posterior(result, model)"]
-        html = web_page.preformatted("\n".join(lines)) + html
-    if not html:
-        return web_page.paragraph("The result does not say how it was made.", "note")
-    return html + web_page.paragraph("The seed makes the draws the same in the same environment: data, machine and "
-                                      "versions (see Settings). A folder with a result is not replaced; name another "
-                                      "one, or add --overwrite.", "note")
+def _commands(result: Any, attrs: Mapping[str, Any]) -> list[str]:
+    """Return the commands or calls that give the same numbers, in their order."""
+    call = [str(attrs["call"])] if "call" in attrs else []
+    if call and "effective_draws" in attrs:
+        call += ["lfm.check_accuracy(result, model)", "result = lfm.correct_posterior(result, model)"]
+    groups = [arviz_data.group(result, name) for name in (report.GROUP, predictions.GROUP)
+              if arviz_data.has_group(result, name)]
+    first = [str(attrs["command_line"])] if "command_line" in attrs else call
+    return [*first, *(str(group.attrs["command_line"]) for group in groups if group.attrs.get("command_line"))]
 
 
-def _files(path: Path) -> str:
+def _files(path: Path) -> list[str]:
     if not path.parent.is_dir():
-        return ""
+        return []
     names = sorted(entry.name for entry in path.parent.iterdir() if entry.is_file() and _FILES.fullmatch(entry.name)
                    and entry.name != path.name and not entry.name.startswith("."))
     corrected = f"corrected/{NAME}"  # where `lfm-ppl check --correct` writes
-    return web_page.file_list([*names, *([corrected] if (path.parent / corrected).is_file() else [])])
+    return [*names, *([corrected] if (path.parent / corrected).is_file() else [])]

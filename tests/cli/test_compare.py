@@ -111,7 +111,7 @@ def test_an_index_that_fails_does_not_cost_the_tables(run, wanted, monkeypatch):
     def fail(*args, **kwargs):
         raise OSError("no space left")
 
-    monkeypatch.setattr("lfm_ppl.results.web_page.write", fail)
+    monkeypatch.setattr("lfm_ppl.results.html_report.write_page", fail)
     code, out, err = run("compare gps --out here --quiet")
     assert code == 1 and "EKF  0.500" in out and "the page could not be written: no space left" in err
 

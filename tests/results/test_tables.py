@@ -1,4 +1,4 @@
-"""Tables: what stands in them, and how they stand."""
+"""Tables: the numbers in them, their width, and their files."""
 
 import math
 import os
@@ -8,13 +8,7 @@ import pandas as pd
 import pytest
 
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.tables import (
-    format_number,
-    markdown_table,
-    text_table,
-    write_csv,
-    write_markdown,
-)
+from lfm_ppl.results.tables import format_number, markdown_table, text_table, write_csv, write_markdown
 from lfm_ppl.utils.atomic_files import atomic_write
 
 COLUMNS = ["mean", "sd", "q2.5", "q97.5", "mcse_mean", "ess_bulk", "ess_tail", "r_hat"]
@@ -30,113 +24,55 @@ def frame():
     return pd.DataFrame.from_dict(rows, orient="index", columns=COLUMNS)
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (0.80123, "0.801"),
-        (0.0, "0"),
-        (-0.05, "-0.0500"),
-        (9.9999, "10.0"),
-        (99.96, "100"),
-        (0.00099996, "0.00100"),
-        (1234.5, "1234"),
-        (999999.0, "999999"),
-        (1e6, "1.00e+06"),
-        (9.99e-5, "9.99e-05"),
-        (3, "3"),
-        (np.int64(12345678), "12345678"),
-        (math.nan, "-"),
-        (None, "-"),
-        (-math.inf, "-inf"),
-        (True, "True"),
-        ("text", "text"),
-    ],
-)
-def test_format_number(value, text):
-    assert format_number(value) == text
+def test_format_number():
+    values = {0.80123: "0.801", 0.0: "0", -0.05: "-0.0500", 9.9999: "10.0", 99.96: "100", 0.00099996: "0.00100",
+              1234.5: "1234", 999999.0: "999999", 1e6: "1.00e+06", 9.99e-5: "9.99e-05", 3: "3",
+              np.int64(12345678): "12345678", math.nan: "-", None: "-", -math.inf: "-inf", "text": "text"}
+    assert {value: format_number(value) for value in values} == values
+    assert format_number(True) == "True"
+    numbers = np.concatenate([10.0 ** np.linspace(-8, 8, 97), -(10.0 ** np.linspace(-8, 8, 13))])
+    for digits in (1, 2, 4, 6):
+        errors = [abs(float(format_number(number, digits)) / number - 1.0) for number in numbers]
+        assert max(errors) <= 0.5000001 * 10.0 ** (1 - digits)
 
 
-@pytest.mark.parametrize("digits", [1, 2, 4, 6])
-def test_format_number_keeps_the_digits(digits):
-    values = np.concatenate([10.0 ** np.linspace(-8, 8, 97), -(10.0 ** np.linspace(-8, 8, 13))])
-    for value in values:
-        error = abs(float(format_number(value, digits)) / value - 1.0)
-        assert error <= 0.5000001 * 10.0 ** (1 - digits), value
-
-
-def test_text_table_is_aligned_and_80_wide(frame):
+def test_text_table(frame):
     lines = text_table(frame).splitlines()
-    assert max(map(len, lines)) <= 80
-    assert len(lines) == 5  # one block: two lines of header, three rows
-    assert lines[1].split() == ["mean", "sd", "q2.5", "q97.5", "mean", "bulk", "tail", "r_hat"]
-    assert lines[0].split() == ["mcse", "ess", "ess"]
-    assert len({len(line) for line in lines[1:]}) == 1  # the last column is aligned right
-    assert lines[2].split() == [
-        "decay[CDKN1A]", "0.800", "0.100", "0.610", "1.00", "0.0012", "3012", "2950", "1.000",
-    ]  # fmt: skip
-    assert lines[3].split()[-3:] == ["400", "400", "1.012"]
+    assert max(map(len, lines)) <= 80 and len(lines) == 5
+    assert lines[2].split() == ["decay[CDKN1A]", "0.800", "0.100", "0.610", "1.00", "0.0012", "3012", "2950", "1.000"]
     assert lines[4].split()[-3:] == ["-", "-", "-"]
-
-
-def test_text_table_continues_below_when_too_wide(frame):
-    table = text_table(frame, width=40)
-    assert max(map(len, table.splitlines())) <= 40
-    blocks = table.split("\n\n")
-    assert len(blocks) > 1
-    assert all(block.count("decay[CDKN1A]") == 1 for block in blocks)
+    assert len({len(line) for line in lines[1:]}) == 1, "the last column is aligned right"
+    blocks = text_table(frame, width=40).split("\n\n")
+    assert len(blocks) > 1 and all(block.count("decay[CDKN1A]") == 1 for block in blocks)
+    assert max(len(line) for block in blocks for line in block.splitlines()) <= 40
     words = " ".join(" ".join(block.splitlines()[-4].split()) for block in blocks)
     assert words == "mean sd q2.5 q97.5 mean bulk tail r_hat"
+    texts = pd.DataFrame({"name": ["x", "longer"], "count": [1, 22]}, index=["a", "b"])
+    assert text_table(texts).splitlines() == ["   name    count", "a  x           1", "b  longer     22"]
+    assert text_table(texts.iloc[:0]).split() == ["name", "count"]
+    narrow = text_table(pd.DataFrame({"a": [1.0], "b": [2.0]}, index=["a_name_of_thirty_characters_ok"]), width=20)
+    assert "1.00" in narrow and "2.00" in narrow
 
 
-def test_text_table_keeps_names_that_are_wider_than_the_line():
-    frame = pd.DataFrame({"a": [1.0], "b": [2.0]}, index=["a_name_of_thirty_characters_ok"])
-    lines = text_table(frame, width=20).splitlines()
-    assert [line for line in lines if line.endswith("1.00")]
-    assert [line for line in lines if line.endswith("2.00")]
-
-
-def test_text_table_of_text_and_of_nothing():
-    frame = pd.DataFrame({"name": ["x", "longer"], "count": [1, 22]}, index=["a", "b"])
-    assert text_table(frame).splitlines() == [
-        "   name    count",
-        "a  x           1",
-        "b  longer     22",
-    ]
-    assert text_table(frame.iloc[:0]).split() == ["name", "count"]
-
-
-def test_summary_of_a_result_fits_the_terminal(result):
-    table = text_table(arviz_data.summary(result))
-    assert max(map(len, table.splitlines())) <= 80
-    assert table.count("\n\n") == 0
-
-
-def test_markdown_table(frame):
-    lines = markdown_table(frame.rename(index={"mass": "a|b"})).splitlines()
+def test_markdown_table(frame, tmp_path):
+    table = markdown_table(frame.rename(index={"mass": "a|b"}))
+    lines = table.splitlines()
     assert lines[0].replace(" ", "") == "||" + "|".join(COLUMNS) + "|"
-    assert set(lines[1]) <= set("|-: ")
-    assert lines[1].count("-:") == 8 and lines[1].count(":-") == 1
-    assert r"| a\|b " in lines[4]
-    assert len({len(line) for line in lines}) == 1
-
-
-def test_csv_keeps_full_precision(tmp_path, result):
-    frame = arviz_data.summary(result)
-    path = write_csv(frame, tmp_path / "new" / "summary.csv")
-    assert path.read_text().startswith("parameter,mean,sd,q2.5,q97.5,")
-    pd.testing.assert_frame_equal(
-        pd.read_csv(path, index_col="parameter"), frame, check_names=False, rtol=1e-15
-    )
-    with pytest.raises(FileExistsError, match="already exists"):
-        write_csv(frame, path)
-    write_csv(frame.iloc[:1], path, overwrite=True)
-    assert len(path.read_text().splitlines()) == 2
-    assert os.listdir(path.parent) == ["summary.csv"]
-
-
-def test_markdown_file(tmp_path, frame):
+    assert lines[1].count("-:") == 8 and lines[1].count(":-") == 1 and r"| a\|b " in lines[4]
     path = write_markdown(frame, tmp_path / "summary.md")
     assert path.read_text(encoding="utf-8") == markdown_table(frame) + "\n"
+
+
+def test_csv_keeps_full_precision_and_the_truth(tmp_path, result):
+    frame = arviz_data.summary(result)
+    path = write_csv(frame, tmp_path / "new" / "summary.csv")
+    assert path.read_text().startswith("parameter,mean,sd,q2.5,q97.5,truth,mcse_mean,ess_bulk,ess_tail,r_hat\n")
+    assert frame["truth"]["decay[SESN1]"] == 0.4 and np.isnan(frame["truth"]["noise_sd"])
+    pd.testing.assert_frame_equal(pd.read_csv(path, index_col="parameter"), frame, check_names=False, rtol=1e-15)
+    with pytest.raises(FileExistsError):
+        write_csv(frame, path)
+    write_csv(frame.iloc[:1], path, overwrite=True)
+    assert len(path.read_text().splitlines()) == 2 and os.listdir(path.parent) == ["summary.csv"]
 
 
 def test_a_killed_write_leaves_the_old_file(tmp_path):
@@ -146,14 +82,9 @@ def test_a_killed_write_leaves_the_old_file(tmp_path):
         temporary.write_text("half")
         assert temporary.parent == path.parent and temporary.suffix == ".csv"
         raise KeyboardInterrupt
-    assert path.read_text() == "old"
-    assert os.listdir(tmp_path) == ["a.csv"]
-
-
-def test_a_file_that_appears_meanwhile_is_kept(tmp_path):
-    path = tmp_path / "a.csv"
-    with pytest.raises(FileExistsError), atomic_write(path) as temporary:
+    assert path.read_text() == "old" and os.listdir(tmp_path) == ["a.csv"]
+    new = tmp_path / "b.csv"
+    with pytest.raises(FileExistsError), atomic_write(new) as temporary:
         temporary.write_text("ours")
-        path.write_text("theirs")
-    assert path.read_text() == "theirs"
-    assert os.listdir(tmp_path) == ["a.csv"]
+        new.write_text("theirs")
+    assert new.read_text() == "theirs" and sorted(os.listdir(tmp_path)) == ["a.csv", "b.csv"]
