@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
 from lfm_ppl.inference.handlers.pinned import Pinned
@@ -39,13 +41,57 @@ def prior(distribution: Any) -> str:
 
 def _in_words(distribution: Any, size: int | None = None, entries: np.ndarray | None = None) -> str:
     """Return name and arguments of a distribution; of a long vector the arguments of some entries."""
-    while hasattr(distribution, "base_dist") and type(distribution).__name__ in (
-            "Independent", "ExpandedDistribution", "MaskedDistribution"):
-        distribution = distribution.base_dist
+    distribution = _unwrapped(distribution)
     values: list[Any] = [getattr(distribution, name, None) for name in distribution.arg_constraints]
     if entries is not None:
         values = [np.asarray(value)[entries] if np.shape(value) == (size,) else value for value in values]
     return f"{type(distribution).__name__}({', '.join(_number(value) for value in values if value is not None)})"
+
+
+def prior_interval(distribution: Any) -> str:
+    """Return the median and the 95% interval of a prior, entry by entry, and its name in words.
+
+    Example:
+        >>> import jax.numpy as jnp, numpyro.distributions as dist
+        >>> prior_interval(dist.LogNormal(0.0, 0.5).expand([3]).to_event(1))
+        'median 1, 95% 0.375 to 2.66 (LogNormal)'
+    """
+    if isinstance(distribution, Pinned):
+        words = prior(distribution)
+        free = np.setdiff1d(np.arange(distribution.shape()[0]), distribution.indices)
+        fixed = words[words.index("fixed: "):]
+        return f"{_interval_in_words(distribution.base, free)}; {fixed}" if free.size else fixed
+    return _interval_in_words(distribution)
+
+
+def _interval_in_words(distribution: Any, entries: Any = ...) -> str:
+    base = _unwrapped(distribution)
+    if base.support.is_discrete:
+        return _in_words(base)
+    try:
+        quantiles = [np.asarray(base.icdf(probability)) for probability in _INTERVAL]
+    except (NotImplementedError, ImportError, AttributeError):  # no closed form: draws give two digits
+        draws = base.sample(jax.random.key(0), (_DRAWS,))
+        quantiles = [_rounded(value) for value in np.quantile(draws, _INTERVAL, axis=0)]
+    median, low, high = (_number(np.broadcast_to(value, distribution.shape())[entries]) for value in quantiles)
+    return f"median {median}, 95% {low} to {high} ({type(base).__name__})"
+
+
+_INTERVAL = (0.5, 0.025, 0.975)
+"""Probabilities of the median and of the ends of the 95% interval."""
+
+_DRAWS = 20_000
+"""Number of draws for the quantiles of a prior without closed form."""
+
+_rounded = np.vectorize(lambda value: float(f"{value:.2g}"), otypes=[float])
+
+
+def _unwrapped(distribution: Any) -> Any:
+    """Return the distribution of single entries, without expansions, masks and reinterpreted dimensions."""
+    while hasattr(distribution, "base_dist") and type(distribution).__name__ in (
+            "Independent", "ExpandedDistribution", "MaskedDistribution"):
+        distribution = distribution.base_dist
+    return distribution
 
 
 def support(constraint: Any) -> str:
@@ -89,6 +135,25 @@ def assumptions(model: LatentForceModel) -> dict[str, str]:
     return {"observation": "; ".join(_observation(model.observation, model.output_names)),
             "forces": "; ".join(forces) or "none", "initial state": "; ".join(states) or "none"}
 
+
+def without_parameters(description: str, another: str) -> str:
+    """Return a description without the numbers that depend on parameters.
+
+    Args:
+        description: of the model, see `assumptions`.
+        another: the same at other values of all parameters.
+
+    Example:
+        >>> without_parameters("u: Matern (scale 1, order 2)", "u: Matern (scale 1.3, order 2)")
+        'u: Matern (scale estimated, order 2)'
+    """
+    texts = [_NUMBER.split(text) for text in (description, another)]
+    if len(texts[0]) != len(texts[1]):
+        return description
+    return "".join(first if first == second else "estimated" for first, second in zip(*texts, strict=True))
+
+
+_NUMBER = re.compile(r"(\[[^\]]*\]|(?<![\w.])-?\d[\d.]*(?:e[+-]?\d+)?)")
 
 _FORCE_ATTRIBUTES = ("scale", "lengthscale", "period", "order")
 """Attributes in the description of a force, where it has them."""

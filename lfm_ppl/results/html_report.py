@@ -64,9 +64,9 @@ def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figur
                 more: Mapping[str, pd.DataFrame] | None = None) -> Path:
     """Write a result as one HTML page that needs nothing but itself: no network, no script, no other file.
 
-    It begins with the warnings, the forces, the fit and the table of the parameters. The forecast and the verdict of the
-    accuracy check, where the result has them, and further figures follow. Model, data, settings, commands and links to
-    the files beside the page come last. All text is escaped. It reads in light and dark, on a phone and on paper.
+    It begins with the warnings, the forces, the fit and the table of the parameters. The forecast and the verdict of
+    the accuracy check, where the result has them, and further figures follow. Model, data, settings, commands and links
+    to the files beside the page come last. It reads in light and dark, on a phone and on paper.
 
     Args:
         result: of `lfm_ppl.fit`, `lfm_ppl.to_arviz` or `lfm_ppl.forecast`, or read by `lfm_ppl.load`.

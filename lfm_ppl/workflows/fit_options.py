@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
@@ -13,7 +14,8 @@ import jax
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.priors import assumptions, prior
+from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.priors import assumptions, prior_interval, without_parameters
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.results import run_record
 from lfm_ppl.utils import checks
@@ -124,12 +126,19 @@ def check_sizes(sampler: str, chains: int, warmup: int | None, samples: int, thi
 def describe_priors(bound: BoundModel) -> str:
     """Return name -> prior in words, as JSON."""
     trace = bound.trace()
-    return json.dumps({name: prior(trace[name]["fn"]) for name in bound.sites})
+    return json.dumps({name: prior_interval(trace[name]["fn"]) for name in bound.sites})
 
 
 def describe_assumptions(bound: BoundModel) -> str:
-    """Return the model's observations, forces and initial state in words, with typical numbers, as JSON."""
-    return json.dumps(assumptions(bound.site.example.ssm.model))
+    """Return the model's observations, forces and initial state in words, without estimated numbers, as JSON."""
+    trace = bound.trace()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a draw of the prior may be extreme
+        another = bound.likelihood({name: trace[name]["fn"].sample(jax.random.key(0)) for name in bound.sites})
+    example = another.first if isinstance(another, Panel) else another
+    others = assumptions(example.ssm.model)
+    return json.dumps({topic: without_parameters(description, others[topic])
+                       for topic, description in assumptions(bound.site.example.ssm.model).items()})
 
 
 def model_docstring(numpyro_model: Any) -> str | None:

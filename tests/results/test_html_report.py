@@ -68,7 +68,8 @@ def attrs():
         "sampler": "nuts", "seed": 3, "fixed": json.dumps({"decay[a]": 0.8}), "data": "genes.csv",
         "command_line": "lfm-ppl fit gene.py --data genes.csv", "time_origin": "2024-03-01T00:00:00",
         "priors": json.dumps({"decay": "median 1, 95% 0.37 to 2.7", "rate": "HalfNormal(1)"}),
-        "meanings": json.dumps({"decay": "loss per hour"}), "assumptions": json.dumps({"initial state": "x = 0 (known)"}),
+        "meanings": json.dumps({"decay": "loss per hour"}),
+        "assumptions": json.dumps({"initial state": "x = 0 (known)"}),
     }
 
 
@@ -198,7 +199,8 @@ def test_only_a_page_of_lfm_ppl_is_replaced(groups, attrs, tmp_path, capsys, mon
     with pytest.raises(FileExistsError, match=r"report\.html"):
         cli_page.refuse_foreign(tmp_path, False)
     cli_page.refuse_foreign(tmp_path, True)
-    assert cli_page.save(result, tmp_path, True, ()) == 0 and [entry.name for entry in tmp_path.iterdir()] == [path.name]
+    assert cli_page.save(result, tmp_path, True, ()) == 0
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
     def fail(*arguments, **keywords):
         raise OSError("no space left")
