@@ -202,6 +202,18 @@ class BoundModel:
             lambda z, y: -traced.potential(z, y, remove_likelihood)))
         return run(self._position(z), self._argument(y))
 
+    def site_log_priors(self, values: Mapping[str, Any], y: Any = None) -> dict[str, jax.Array]:
+        """Return the log prior density of each site, conditional on the sites that it depends on.
+
+        Args:
+            values: site name -> value.
+            y: as in `log_density`.
+        """
+        trace = self.traced.trace_at(values, self.data(y))
+        densities = {name: trace[name]["fn"].log_prob(trace[name]["value"]).sum() for name in self.sites}
+        return {name: density if (scale := trace[name]["scale"]) is None else scale * density
+                for name, density in densities.items()}
+
     def objective(self, jacobian: bool = True, forward_mode: bool | None = None,
                   exact_hessian: bool = False) -> Objective:
         """Return MINUS the log density as the objective of a search for its mode.

@@ -47,6 +47,10 @@ _ADAPTIVE_FACTOR = 5
 """Largest number of adaptive steps, as a multiple of the number of equal steps."""
 
 
+LOG_PRIOR = "log prior of "
+"""Start of the names of the log prior densities among the scores."""
+
+
 def scores(bound: BoundModel, draws: Mapping[str, Any], *,
            report: Reporter | None = None, store: BatchStore | None = None) -> Any:
     """Score the observations under each draw.
@@ -59,7 +63,8 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *,
 
     Returns:
         ``leave_one_out`` (S, ..., T), ``one_step_ahead`` (S, ..., T), ``residual`` (S, ..., T, D); the series of a
-        panel come after the draws. Under constraints the last two ignore the constraints.
+        panel come after the draws. Under constraints the last two ignore the constraints. The log prior density (S,)
+        of each site has the name of the site after `LOG_PRIOR`.
     """
 
     def score_series(distribution: SeriesLikelihood, y: jax.Array) -> dict[str, jax.Array]:
@@ -68,7 +73,8 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *,
                 "residual": result.whitened_innovation}
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
-        return map_series(bound.likelihood(values, y), score_series, bound.data(y))
+        log_priors = {LOG_PRIOR + name: value for name, value in bound.site_log_priors(values, y).items()}
+        return map_series(bound.likelihood(values, y), score_series, bound.data(y)) | log_priors
 
     return map_draws(bound, "scores", per_draw, draws, jax.random.key(0), rows=bound.times.size, report=report,
                      store=store)

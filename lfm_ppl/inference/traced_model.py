@@ -148,6 +148,12 @@ class TracedModel:
         """Return NumPyro's trace of the model at the prior's medians."""
         return self._trace(y, self.key, init_to_median)
 
+    def trace_at(self, values: Mapping[str, Any], y: Any) -> dict[str, Any]:
+        """Return NumPyro's trace of the model at values of its sites."""
+        substituted = handlers.substitute(self.with_constant_times(), data={
+            name: jnp.asarray(value, float) for name, value in values.items()})
+        return handlers.trace(substituted).get_trace(*self.call(y), **self.keywords)
+
     def draw(self, y: Any, key: jax.Array, strategy: Callable) -> jax.Array:
         """Return unconstrained values of the latent sites, (d,), by a NumPyro initialisation strategy."""
         def run(key: jax.Array, y: Any) -> jax.Array:
@@ -182,9 +188,7 @@ class TracedModel:
 
     def unconstrain(self, values: Mapping[str, Any], y: Any) -> tuple[jax.Array, dict[str, Any]]:
         """Return z (d,) at the values of the latent sites, and the trace of these sites."""
-        substituted = handlers.substitute(self.with_constant_times(), data={
-            name: jnp.asarray(value, float) for name, value in values.items()})
-        trace = latent_sites(handlers.trace(substituted).get_trace(*self.call(y), **self.keywords))
+        trace = latent_sites(self.trace_at(values, y))
         return ravel_pytree(_unconstrained(trace))[0], trace
 
     def with_constant_times(self) -> Callable:

@@ -44,6 +44,7 @@ _HOW_TO_GET = {
     "posterior": "lfm.fit",
     "sample_stats": "lfm.fit",
     "log_likelihood": "lfm.fit",
+    "log_prior": "lfm.fit",
     "one_step_ahead": "lfm.fit",
     "posterior_predictive": "lfm.fit with trajectory_draws above zero",
     "trajectories": "lfm.fit with trajectory_draws above zero",

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from lfm_ppl.inference.posterior import LOG_PRIOR
 from lfm_ppl.io.truth import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
 from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, mixture_quantiles, predictions
@@ -175,6 +176,8 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
         split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in scores.items()}
         left_out = xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock, **which})
         groups["log_likelihood"] = left_out.isel(time=seen)
+        groups["log_prior"] = xr.Dataset({label.removeprefix(LOG_PRIOR): (("chain", "draw"), value)
+                                          for label, value in split.items() if label.startswith(LOG_PRIOR)}, coords)
         groups["one_step_ahead"] = xr.Dataset(
             {"log_density": variable(sample, split["one_step_ahead"]),
              "residual": variable((*sample, "output"), split["residual"])}, {**coords, **observed_coords})

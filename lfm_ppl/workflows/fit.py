@@ -162,7 +162,9 @@ def fit(
           ``derived``;
         - ``sample_stats``;
         - ``log_likelihood``: the Gaussian filter's leave-one-out conditionals log p(y_k | y_-k, theta), which make
-          ``az.loo`` right for dependent data;
+          ``az.loo`` right for dependent data. ArviZ's functions on replicated data take one output, at the draws that
+          have trajectories: ``az.loo_pit(result.sel(output="a", draw=result["trajectories"]["draw"]))``;
+        - ``log_prior``: the log prior density of each parameter, for ``az.psense_summary``;
         - ``one_step_ahead``: log p(y_k | y_1:k-1, theta) and standardised residuals;
         - ``trajectories``: forces, states, deterministics and noise-free outputs at ``at``, given the data; from the
           Gaussian smoother, and for "pmmh" from the particle smoother. Where densities are known, mean and 95% interval

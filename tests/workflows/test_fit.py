@@ -64,6 +64,7 @@ def test_groups_and_dimensions(nuts):
         "posterior": {"decay": ("chain", "draw", "output"), "lengthscale": ("chain", "draw"),
                       "noise_sd": ("chain", "draw")},
         "log_likelihood": {"y": ("chain", "draw", "time")},
+        "log_prior": {name: ("chain", "draw") for name in ("decay", "lengthscale", "noise_sd")},
         "one_step_ahead": {"log_density": ("chain", "draw", "time"), "residual": ("chain", "draw", "time", "output")},
         "posterior_predictive": {"y": ("chain", "draw", "time", "output")},
         "trajectories": {"forces": ("chain", "draw", "at", "force"), "states": ("chain", "draw", "at", "state"),
