@@ -91,9 +91,7 @@ def groups(result: Any) -> tuple[str, ...]:
         return tuple(str(name) for name in result.children)
     if hasattr(result, "groups") and callable(result.groups):
         return tuple(result.groups())
-    raise TypeError(
-        f"result must be what lfm.fit or lfm.load returned, got {type(result).__name__}."
-    )
+    raise TypeError(f"result must be what lfm.fit or lfm.load returned, got {type(result).__name__}.")
 
 
 def has_group(result: Any, name: str) -> bool:
@@ -230,9 +228,7 @@ def ess(result: Any, method: str = "bulk") -> pd.Series:
     """
     if method == "tail":
         # ArviZ 1.x has another default probability than 0.23.
-        return _diagnostic(
-            result, lambda draws: load_arviz().ess(draws, method="tail", prob=(0.05, 0.95))
-        )
+        return _diagnostic(result, lambda draws: load_arviz().ess(draws, method="tail", prob=(0.05, 0.95)))
     return _diagnostic(result, lambda draws: load_arviz().ess(draws, method=method))
 
 
@@ -318,8 +314,9 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     """
     attrs = attributes(result)
     constrained, from_mode = "constraints" in attrs, attrs.get("sampler") == "map"
-    of_sites = convergence.of_sites(*json.loads(attrs.get(SITES, "[0, 0, 0]")), constrained=constrained,
-                                    from_mode=from_mode)
+    of_sites = convergence.of_sites(
+        *json.loads(attrs.get(SITES, "[0, 0, 0]")), constrained=constrained, from_mode=from_mode
+    )
     of_sites += convergence.of_weights(*json.loads(attrs.get(WEIGHTS, "[0, 0, 0]")))
     if of_mode(result):
         rows = summary(result) if table is None else table
@@ -330,8 +327,9 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     sizes = group(result, "posterior").sizes
     stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
     divergences = int(stats["diverging"].sum()) if "diverging" in stats else 0
-    messages = convergence.messages(summary(result) if table is None else table, sizes["chain"], sizes["draw"],
-                                 divergences)
+    messages = convergence.messages(
+        summary(result) if table is None else table, sizes["chain"], sizes["draw"], divergences
+    )
     return messages + of_sites
 
 
@@ -397,17 +395,12 @@ def _degenerate(result: Any) -> list[str]:
     return [labels[name][index] for name, indices in variables.items() if name in labels for index in indices]
 
 
-def _diagnostic(
-    result: Any, measure: Callable[[np.ndarray], Any], min_chains: int = 1
-) -> pd.Series:
+def _diagnostic(result: Any, measure: Callable[[np.ndarray], Any], min_chains: int = 1) -> pd.Series:
     """Apply ``measure`` to the (chain, draw) array of every scalar where it is defined."""
     values = {}
     for label, draws in scalar_draws(group(result, "posterior")).items():
         defined = (
-            draws.shape[0] >= min_chains
-            and draws.shape[1] >= 4
-            and np.all(np.isfinite(draws))
-            and np.ptp(draws) > 0.0
+            draws.shape[0] >= min_chains and draws.shape[1] >= 4 and np.all(np.isfinite(draws)) and np.ptp(draws) > 0.0
         )
         values[label] = float(measure(draws)) if defined else np.nan
     return pd.Series(values, dtype=float)

@@ -91,7 +91,8 @@ class Checkpoint:
         path = checkpoint._store.folder / _RUN
         if not path.is_file():
             raise FileNotFoundError(f"{folder} holds no run to resume; expected the folder of an unfinished run.")
-        checkpoint.record = _read_record(path)
+        with _explain_damage(path):
+            checkpoint.record = dict(json.loads(path.read_text(encoding="utf-8")))
         check_same(folder, checkpoint.record, record)
         state = checkpoint._store.get(_STATE)
         checkpoint._earlier_seconds = 0.0 if state is None else float(state["seconds"])
@@ -127,7 +128,11 @@ class Checkpoint:
             return None
         self._stored_draws = int(state["draws"])
         leaves = [state[f"leaf{index}"] for index in range(int(state["leaves"]))]
-        return Saved(int(state["done"]), leaves, {str(name): self._read_draws(str(name)) for name in state["names"]})
+        draws = {}
+        for name in state["names"]:
+            with _explain_damage(path := self._draws_path(name)):
+                draws[str(name)] = np.load(path)
+        return Saved(int(state["done"]), leaves, draws)
 
     def due(self) -> bool:
         """Return whether the stored state is older than a second."""
@@ -182,14 +187,6 @@ class Checkpoint:
     def _draws_path(self, name: str) -> Path:
         return self._store.folder / f"draws-{name}.npy"
 
-    def _read_draws(self, name: str) -> np.ndarray:
-        path = self._draws_path(name)
-        try:
-            return np.load(path)
-        except (OSError, EOFError, ValueError) as error:
-            raise DamagedFileError(f"{path} is damaged ({type(error).__name__}: {error}). Start the run anew with "
-                                   "overwrite=True (--overwrite), or in another folder.") from error
-
 
 class Batches:
     """Batches of results by the index of their first draw; a batch is an array or a dict of arrays.
@@ -235,20 +232,14 @@ class Batches:
         self._write_time = time.perf_counter()
 
 
-def _read_record(path: Path) -> dict[str, Any]:
-    """Return the record of a run.
-
-    Raises:
-        ValueError: the file is no record.
-    """
+@contextlib.contextmanager
+def _explain_damage(path: Path) -> Iterator[None]:
+    """Name the file of an error in the block, which reads it."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(record, dict):
-            raise ValueError(f"it holds {record!r:.20}, not a mapping")
-    except ValueError as error:  # of JSON, or of UTF-8
-        raise ValueError(f"{path} is not the record of a run ({error}), which cannot be resumed. Start it anew with "
-                         "overwrite=True (--overwrite), or in another folder.") from None
-    return record
+        yield
+    except (OSError, EOFError, TypeError, ValueError) as error:
+        raise DamagedFileError(f"{path} is damaged ({type(error).__name__}: {error}). Start the run anew with "
+                               "overwrite=True (--overwrite), or in another folder.") from error
 
 
 def check_folder(folder: str | Path, resume: bool, overwrite: bool) -> None:

@@ -127,10 +127,7 @@ def _labels(name: str, variable: xr.DataArray) -> list[str]:
     dims = [dim for dim in variable.dims if dim not in SAMPLE_DIMS]
     if not dims:
         return [name]
-    ticks = [
-        variable[dim].values if dim in variable.coords else np.arange(variable.sizes[dim])
-        for dim in dims
-    ]
+    ticks = [variable[dim].values if dim in variable.coords else np.arange(variable.sizes[dim]) for dim in dims]
     return [
         f"{name}[{','.join(str(tick[i]) for tick, i in zip(ticks, index, strict=True))}]"
         for index in np.ndindex(*(len(tick) for tick in ticks))

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from lfm_ppl.results.convergence import listed
 from lfm_ppl.results.importance import LARGEST_K
 from lfm_ppl.results.likelihoods import finer_tolerance
 
@@ -40,7 +41,6 @@ _CLOSER = 0.5
 """Share of the sd of the log ratios that iterations must leave to be recommended."""
 
 _SIGMAS = 2.0
-_NAMED = 4
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _verdict_from(findings: Findings) -> tuple[str, str, str]:
         return _unreliable(findings)
     shifted = _changed(findings.table)
     if shifted:
-        reason = (f"the Gaussian filter has moved {_listed(shifted)}; the importance weights can be relied on "
+        reason = (f"the Gaussian filter has moved {listed(shifted)}; the importance weights can be relied on "
                   f"(k = {findings.k:.2f}, below {findings.threshold:.2f}), and so can the corrected mean and sd.")
         return "corrected", reason, "lfm-ppl check RESULT --correct --overwrite"
     reason = (f"no mean is off by more than {SHIFT} sd and no sd by more than {WIDTH:.0%}, beyond Monte Carlo error "
@@ -230,7 +230,3 @@ def _notes(findings: Findings) -> list[str]:
                      "they have weight zero.")
     return notes
 
-
-def _listed(names: list[str]) -> str:
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")

@@ -162,15 +162,15 @@ def fit(
           ``derived``;
         - ``sample_stats``;
         - ``log_likelihood``: the Gaussian filter's leave-one-out conditionals log p(y_k | y_-k, theta), which make
-          ``az.loo`` right for dependent data. ArviZ's functions on replicated data take one output, at the draws that
-          have trajectories: ``az.loo_pit(result.sel(output="a", draw=result["trajectories"]["draw"]))``;
+          ``az.loo`` right for dependent data;
         - ``log_prior``: the log prior density of each parameter, for ``az.psense_summary``;
         - ``one_step_ahead``: log p(y_k | y_1:k-1, theta) and standardised residuals;
         - ``trajectories``: forces, states, deterministics and noise-free outputs at ``at``, given the data; from the
           Gaussian smoother, and for "pmmh" from the particle smoother. Where densities are known, mean and 95% interval
           of each (``forces_summary`` and so on) and of new data (``new_data_summary``);
         - ``posterior_predictive``: replicated data along these trajectories. (``numpyro.infer.Predictive`` with the
-          same draws simulates NEW forces instead.)
+          same draws simulates NEW forces instead.) ArviZ's predictive checks take one output at these draws:
+          ``az.plot_ppc_pit(result.sel(output="a", draw=result["trajectories"]["draw"]))``;
         - ``predictions``: with ``at``, new observations at these times, with noise; see `forecast`;
         - ``observed_data``, and ``truth`` and ``constant_data`` (known inputs) if there are any.
 

@@ -34,11 +34,7 @@ def posterior(rng):
     shape = (CHAINS, DRAWS)
     return xr.Dataset(
         {
-            "decay": (
-                ("chain", "draw", "gene"),
-                DECAY * np.exp(0.15 * rng.normal(size=(*shape, 3))),
-                {"units": "1/h"},
-            ),
+            "decay": (("chain", "draw", "gene"), DECAY * np.exp(0.15 * rng.normal(size=(*shape, 3))), {"units": "1/h"}),
             "lengthscale": (("chain", "draw"), rng.gamma(20.0, 0.1, shape), {"units": "h"}),
             "noise_sd": (("chain", "draw"), 0.1 * np.exp(0.1 * rng.normal(size=shape))),
             "anchor": (("chain", "draw"), np.full(shape, 0.8)),
@@ -103,9 +99,9 @@ def by_time(rng):
             coords={**sample, "draw": np.arange(THINNED) * 2, **when, **output},
         ),
         # az.loo on ArviZ 1.x fails where the terms of a time are all the same, as with no data.
-        "log_likelihood": xr.Dataset(
-            {"y": (("chain", "draw", "time"), density)}, coords={**sample, **when}
-        ).isel(time=~np.isnan(y).all(axis=1)),
+        "log_likelihood": xr.Dataset({"y": (("chain", "draw", "time"), density)}, coords={**sample, **when}).isel(
+            time=~np.isnan(y).all(axis=1)
+        ),
         "one_step_ahead": xr.Dataset(
             {
                 "log_density": (("chain", "draw", "time"), density),
@@ -120,14 +116,8 @@ def truth():
     time = np.linspace(0.0, 12.0, 49)
     return xr.Dataset(
         {
-            "forces": (
-                ("at_truth", "force"),
-                np.stack([true_force(time, f) for f in FORCES], axis=-1),
-            ),
-            "states": (
-                ("at_truth", "state"),
-                1.1 * np.stack([true_output(time, g) for g in range(3)], axis=-1),
-            ),
+            "forces": (("at_truth", "force"), np.stack([true_force(time, f) for f in FORCES], axis=-1)),
+            "states": (("at_truth", "state"), 1.1 * np.stack([true_output(time, g) for g in range(3)], axis=-1)),
             "decay": ("gene", DECAY),
             "lengthscale": ((), 2.0),
         },
@@ -151,11 +141,7 @@ def datasets():
     return {
         "posterior": posterior(rng),
         "sample_stats": xr.Dataset(
-            {
-                "diverging": (sample, diverging),
-                "lp": (sample, stats[0]),
-                "energy": (sample, stats[1]),
-            },
+            {"diverging": (sample, diverging), "lp": (sample, stats[0]), "energy": (sample, stats[1])},
             coords={"chain": np.arange(CHAINS), "draw": np.arange(DRAWS)},
         ),
         "trajectories": trajectories(rng),
@@ -241,16 +227,9 @@ def crowded():
             "posterior": posterior,
             "observed_data": xr.Dataset({"y": (("time", "output"), y, units)}, coords=over),
             "trajectories": xr.Dataset(
-                {
-                    "outputs": (
-                        (*sample, "at", "output"),
-                        wave[1] + 1e-5 * rng.normal(size=(4, 25, 1, 15)),
-                    )
-                },
+                {"outputs": ((*sample, "at", "output"), wave[1] + 1e-5 * rng.normal(size=(4, 25, 1, 15)))},
                 coords={"at": at, "output": names},
             ),
-            "one_step_ahead": xr.Dataset(
-                {"residual": ((*sample, "time", "output"), noisy)}, coords=over
-            ),
+            "one_step_ahead": xr.Dataset({"residual": ((*sample, "time", "output"), noisy)}, coords=over),
         }
     )

@@ -123,26 +123,21 @@ def test_angles_are_compared_on_the_circle():
     assert result.loc["a", "crps"] < 0.06 < 0.5 < result.loc["b", "crps"]  # b is no angle
 
 
-@pytest.mark.parametrize(("held_out", "message"), [
-    (np.zeros((2, 2)), r"must have shape \(3, 2\).*got \(2, 2\)"),
-    (np.full((3, 2), np.nan), "every entry is missing"),
-    (np.full((3, 2), np.inf), "infinite"),
-    (lfm.Data([2.0, 3.0], np.zeros((2, 1)), ("a",)), "time 3, which was not predicted"),
-    (lfm.Data([2.0], np.zeros((1, 1)), ("c",)), "unknown output 'c'"),
-])
-def test_what_cannot_be_compared(held_out, message):
-    with pytest.raises(ValueError, match=message):
-        lfm.score(predicted(np.zeros((4, 3, 2)), 1.0), held_out)
-
-
-def test_a_result_without_predictions_says_how_to_get_them(result):
-    with pytest.raises(ValueError, match=r"comes from lfm\.forecast"):
+def test_what_cannot_be_compared(result):
+    dataset = predicted(np.zeros((4, 3, 2)), 1.0)
+    for held_out, words in (
+            (np.zeros((2, 2)), "shape"), (np.full((3, 2), np.nan), "missing"), (np.full((3, 2), np.inf), "infinite"),
+            (lfm.Data([2.0, 3.0], np.zeros((2, 1)), ("a",)), "time 3"),
+            (lfm.Data([2.0], np.zeros((1, 1)), ("c",)), "'c'")):
+        with pytest.raises(ValueError, match=words):
+            lfm.score(dataset, held_out)
+    with pytest.raises(ValueError, match="predictions"):
         lfm.score(result, np.zeros((3, 2)))
-    with pytest.raises(ValueError, match="level must lie between 0 and 1"):
-        lfm.score(predicted(np.zeros((4, 3, 2)), 1.0), np.zeros((3, 2)), level=95)
+    with pytest.raises(ValueError, match="level"):
+        lfm.score(dataset, np.zeros((3, 2)), level=95)
 
 
 def test_a_log_score_of_few_draws_is_a_warning():
     dataset = predicted(RNG.normal(size=(400, 3, 2)), 1e-4)
-    with pytest.warns(UserWarning, match="rests on fewer than 10 draws"):
+    with pytest.warns(UserWarning, match="10 draws"):
         lfm.score(dataset, np.zeros((3, 2)))
