@@ -43,8 +43,9 @@ def autocorrelation(residual: np.ndarray, lags: int) -> tuple[np.ndarray, np.nda
     """Return the autocorrelation of a series with gaps, and how many pairs each lag has.
 
     rho_h = mean of (e_k - m)(e_k+h - m) over the pairs that are both there, divided by the mean of
-    (e_k - m)^2. Lags count rows, also where these are not equally spaced in time; of an output that fewer than half of
-    the rows have, its own observations.
+    (e_k - m)^2. Lags count rows, also where these are not equally spaced in time. Of an output
+    that fewer than half of the rows have, or whose observations form hardly any pairs at some lag, as those of every
+    second row, they count its observations.
 
     Args:
         residual: shape (T,), NaN where missing.
@@ -55,7 +56,9 @@ def autocorrelation(residual: np.ndarray, lags: int) -> tuple[np.ndarray, np.nda
         lag without pairs.
     """
     is_finite = np.isfinite(residual)
-    if is_finite.mean() < 0.5:
+    shifts = np.arange(1, min(lags, is_finite.sum() - 1) + 1)
+    if is_finite.mean() < 0.5 or any(4 * (is_finite[:-shift] & is_finite[shift:]).sum() < is_finite.sum() - shift
+                                     for shift in shifts):
         residual = residual[is_finite]
     centred = residual - np.nanmean(residual)
     variance = np.nanmean(centred**2)
