@@ -233,6 +233,10 @@ class Periodic(QuasiPeriodic):
     variance for a periodic Matern force of order 0, and less than 0.01 for order 2 and for a periodic squared
     exponential.
 
+    For a stationary kernel phi_1 is a constant. The force therefore contains an unknown level, its mean over a cycle,
+    with prior variance mu_1, beside the season about it. The data cannot tell this level from another constant of the
+    model, such as an offset of the observation; figures of the force show the sum of level and season.
+
     Args:
         kernel: a periodic kernel, such as `PeriodicMatern`.
         functions: J, the number of eigenfunctions; see `QuasiPeriodic`.
