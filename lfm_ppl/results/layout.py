@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,15 +17,17 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from lfm_ppl.forces.quasi_periodic import QuasiPeriodic
 from lfm_ppl.inference.posterior import LOG_PRIOR
 from lfm_ppl.io.truth import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
-from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, mixture_quantiles, predictions
+from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, PERIODS, mixture_quantiles, predictions
 from lfm_ppl.results.scalars import DERIVED, units_attribute
 from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:
     from lfm_ppl.inference.bound_model import BoundModel
+    from lfm_ppl.model.latent_force_model import LatentForceModel
 
 SERIES, OUTPUT = "series", "output"
 
@@ -192,6 +195,8 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
              for kind in named if paths[kind].shape[-1]},
             {**thinned, **at_coords, **which, **{kind: named[kind] for kind in named if named[kind]}})
         groups["trajectories"]["outputs"].attrs["long_name"] = NOISE_FREE
+        if periods := force_periods(model):
+            groups["trajectories"]["forces"].attrs[PERIODS] = json.dumps(periods)
         groups["trajectories"] = with_summaries(groups["trajectories"], paths)
         if "prediction" in paths and grid is not None:
             groups[GROUP] = predictions(bound, paths, np.asarray(draw_index), grid, labels.coords)
@@ -204,6 +209,13 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
                 truth_group = truth_group.drop_dims(kind)
             groups["truth"] = truth_group.assign(new).assign_coords({kind: named[kind]})
     return groups
+
+
+def force_periods(model: LatentForceModel) -> dict[str, float]:
+    """Return the period of each force that repeats, exactly or nearly, by name."""
+    periods = {name: checks.concrete(force.period) for name, force in model.forces.items()
+               if isinstance(force, QuasiPeriodic)}
+    return {name: float(period) for name, period in periods.items() if period is not None}
 
 
 def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray]) -> xr.Dataset:

@@ -32,6 +32,12 @@ NOISE_FREE = "noise-free output"
 
 INTERVAL = (0.025, 0.975)
 
+PERIODS = "periods"
+"""Attribute of trajectories of forces: name -> period of those that repeat, as JSON."""
+
+SHOWN_PERIODS = 3
+"""Number of periods, the last ones, that figures show of a force that repeats often."""
+
 MEAN, SD, FREE_SD = "y_mean", "y_sd", "outputs_sd"
 """Mean of the normal distribution that y has at each draw, its sd, and its sd without the noise."""
 
@@ -168,6 +174,11 @@ def noise_free_interval(dataset: xr.Dataset) -> np.ndarray:
     if MEAN in dataset and FREE_SD in dataset and bool((dataset[FREE_SD] > 0).any()):
         return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[FREE_SD]), INTERVAL)
     return np.quantile(_flat(dataset["outputs"]), INTERVAL, axis=0)
+
+
+def repeats_often(period: float, span: float) -> bool:
+    """Return whether a figure of a force over ``span`` would show spikes instead of its periods."""
+    return span > 2 * SHOWN_PERIODS * period
 
 
 def _flat(variable: xr.DataArray) -> np.ndarray:

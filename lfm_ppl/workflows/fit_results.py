@@ -34,7 +34,8 @@ from lfm_ppl.results.approximation import approximation_warnings, resolution_war
 from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
-from lfm_ppl.results.layout import Labels, TrajectoryDraws, lay_out
+from lfm_ppl.results.layout import Labels, TrajectoryDraws, force_periods, lay_out
+from lfm_ppl.results.predictions import SHOWN_PERIODS, repeats_often
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
@@ -45,6 +46,9 @@ ONLY_DRAWS = "all draws, without scores and trajectories"
 
 _GRID_POINTS = 200
 """Number of grid points of trajectories where no times are requested."""
+
+_SEASON_POINTS = 97
+"""Number of points in the last periods of a force that repeats often."""
 
 
 class ConvergenceWarning(UserWarning):
@@ -210,7 +214,29 @@ def _trajectory_times(bound: BoundModel, requested_times: Any) -> np.ndarray | N
     if requested_times is not None:
         return np.atleast_1d(np.asarray(requested_times, float))
     origin = float(bound.site.example.time_grid.initial_time)
-    return np.union1d(np.linspace(min(origin, times[0]), times[-1], _GRID_POINTS), times)
+    grid = subdivide(np.union1d(min(origin, times[0]), times), _GRID_POINTS)
+    for period in force_periods(bound.site.example.ssm.model).values():
+        if repeats_often(period, times[-1] - grid[0]):
+            grid = np.union1d(grid, np.linspace(times[-1] - SHOWN_PERIODS * period, times[-1], _SEASON_POINTS))
+    return grid
+
+
+def subdivide(nodes: np.ndarray, count: int) -> np.ndarray:
+    """Return increasing nodes and times that divide each interval equally: ``count`` times or more.
+
+    Between observations the band of a posterior is an arc. Points that divide the intervals equally show it; points on
+    an equal grid over all of them would cut some arcs near the nodes.
+
+    Example:
+        >>> subdivide(np.array([0.0, 1.0, 5.0]), 6)
+        array([0.  , 0.25, 0.5 , 0.75, 1.  , 2.  , 3.  , 4.  , 5.  ])
+    """
+    if len(nodes) < 2:
+        return nodes
+    gaps = np.diff(nodes)
+    parts = np.maximum(np.ceil(gaps * (count - 1) / gaps.sum() * (1 - 1e-12)), np.clip(2 * count // len(nodes), 1, 4))
+    return np.append(np.concatenate([start + gap * np.arange(number) / number
+                                     for start, gap, number in zip(nodes, gaps, parts, strict=False)]), nodes[-1])
 
 
 def build_result(problem: FitProblem, draws: PosteriorDraws, processed: PostProcessing, store: Checkpoint | None,
