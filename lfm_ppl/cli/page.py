@@ -64,8 +64,9 @@ def update(result: Any, folder: Path, figures: Sequence[Path] = (),
 
         # By name: the folder may hold figures of a replaced result.
         figure_paths = [path for name, _, _ in pages_of(result, "full") if (path := folder / f"{name}.png").is_file()]
+        figure_paths = list(dict.fromkeys([*figure_paths, *figures]))
         return html_report.save_report(
-            result, folder / html_report.NAME, overwrite=True, figures=[*figure_paths, *figures], more=more
+            result, folder / html_report.NAME, overwrite=True, figures=figure_paths, more=more
         )
 
     return attempted(write)

@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.plots import style
@@ -30,16 +28,14 @@ _BELOW = -30.0
 
 
 @style.styled
-def plot_accuracy(
-    result: Any, parameters: Sequence[str] | None = None, *, width: str | float = "column"
-) -> Figure:
-    """Draw what `lfm_ppl.check_accuracy` found.
+def plot_accuracy(result: Any, parameters: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
+    """Draw the report of `lfm_ppl.check_accuracy`.
 
-    First the log importance ratio of each draw against its log likelihood under the Gaussian
-    filter, both relative to their mean: a level cloud leaves the posterior as it is, a slope or a
-    curve moves it. Then, for each scalar parameter, the density of the Gaussian filter's posterior
-    (all draws) and that of the corrected one (weighted draws), the means of both, and the true
-    value where it is known. The corrected one is dashed, and its mean left out, where the weights
+    First the error of the filter, exact log likelihood minus that of the filter, for each checked draw against the
+    filter's log likelihood, both relative to their mean: a level cloud leaves the posterior as it is, a slope or a
+    curve moves it. The Pareto shape k of the weights exp(error) stands above. Then, for each scalar parameter, the
+    density of the Gaussian filter's posterior (all draws) and that of the corrected one (weighted draws), the means of
+    both, and the true value where it is known. The corrected one is dashed, and its mean left out, where the weights
     cannot be relied on.
 
     Args:
@@ -73,21 +69,18 @@ def plot_accuracy(
         if label in table.index and report.reliable:
             _mark_means(axes, table.loc[label, "mean"], table.loc[label, "corrected_mean"])
         if label in truth:
-            axes.axvline(truth[label], **_TRUTH)
+            axes.axvline(truth[label], **style.TRUTH)
         unit = f"{style.scale(axes.xaxis)} {units.get(label, '')}".strip()
         axes.set_xlabel(style.with_unit(label, unit, 24))
-    _legend(figure, any(label in truth for label in labels), report)
-    if note:
-        style.note_below(figure, note)
+    style.legend_above(figure)
+    style.note_below(figure, f"{_explanation(report)} {note}")
     return figure
-
-
-_TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.9, "ls": (0, (4, 2))}
 
 
 def _line(report: AccuracyReport) -> dict[str, Any]:
     """Return how to draw the corrected density."""
-    return {"color": style.VERMILLION, "lw": 1.1, "ls": "-" if report.reliable else (0, (2.5, 1.2))}
+    label = "corrected posterior" + ("" if report.reliable else ", not reliable")
+    return {"color": style.VERMILLION, "lw": 1.1, "ls": "-" if report.reliable else (0, (2.5, 1.2)), "label": label}
 
 
 def _draw_ratios(axes: Axes, report: AccuracyReport) -> None:
@@ -99,13 +92,12 @@ def _draw_ratios(axes: Axes, report: AccuracyReport) -> None:
     if np.nanmax(sd) > 0.0:
         sd = np.where(np.isfinite(sd), sd, 0.0)
         axes.errorbar(x, y, yerr=sd, fmt="none", ecolor=style.SKY, elinewidth=0.4, zorder=1)
-    axes.plot(x, y, color=style.BLUE, ls="", marker="o", ms=1.8, mew=0, alpha=0.6, zorder=2)
+    axes.plot(x, y, color=style.BLUE, ls="", marker="o", ms=1.8, mew=0, alpha=0.6, zorder=2, label="draw")
     if np.ptp(y) < 1e-6:
         axes.set_ylim(-1.0, 1.0)
-    axes.set_xlabel("log likelihood, relative")
-    axes.set_ylabel("log ratio, relative")
-    reliable = "reliable" if report.reliable else "not reliable"
-    axes.set_title("the filter is exact" if report.exact else f"k = {report.k:.2f} ({reliable})")
+    axes.set_xlabel("log likelihood, filter")
+    axes.set_ylabel("exact − filter")
+    axes.set_title("exact filter" if report.exact else f"k = {report.k:.2f} (limit {report.threshold:.2f})")
 
 
 def _draw_densities(
@@ -119,7 +111,7 @@ def _draw_densities(
     # What the weights change on the subset, as for the moments: the subset's own chance cancels.
     equal = np.full(subset.size, 1.0 / subset.size)
     change = _density(grid, subset, weight, support, width) - _density(grid, subset, equal, support, width)
-    axes.fill_between(grid, density, color=style.SKY, alpha=0.5, lw=0)
+    axes.fill_between(grid, density, color=style.SKY, alpha=0.5, lw=0, label="posterior of the filter")
     axes.plot(grid, np.maximum(density + change, 0.0), **line)
     axes.set_ylim(0.0, None)
     axes.set_yticks([])
@@ -160,16 +152,15 @@ def _mark_means(axes: Axes, posterior_mean: float, corrected_mean: float) -> Non
     """Mark the means under the densities."""
     where = axes.get_xaxis_transform()
     for mean, colour in ((posterior_mean, style.BLUE), (corrected_mean, style.VERMILLION)):
-        axes.plot(mean, 0.04, color=colour, marker="^", ms=4, mew=0, ls="", transform=where, zorder=4)
+        axes.plot(mean, 0.04, color=colour, marker="^", ms=4, mew=0, ls="", transform=where, zorder=4, label="its mean")
 
 
-def _legend(figure: Figure, truth: bool, report: AccuracyReport) -> None:
-    handles: list[Any] = [
-        Patch(color=style.SKY, alpha=0.5, label="Gaussian filter"),
-        Line2D([], [], label="corrected" if report.reliable else "corrected, not reliable", **_line(report)),
-    ]
+def _explanation(report: AccuracyReport) -> str:
+    """Return how to read the figure."""
+    if report.exact:
+        return "The filter is exact for this model: there is nothing to correct."
+    error = ("First panel: log likelihood of checked draws, each axis relative to its mean. Where the cloud is level, "
+             "the error of the filter does not change the posterior.")
     if report.reliable:
-        handles.append(Line2D([], [], color=style.GREY, marker="^", ms=4, mew=0, ls="", label="mean"))
-    if truth:
-        handles.append(Line2D([], [], label="truth", **_TRUTH))
-    style.legend_above(figure, handles)
+        return f"{error} k below its limit: the corrected posteriors can be relied on."
+    return f"{error} k above its limit: the weights fail, and the corrected posteriors cannot be relied on."

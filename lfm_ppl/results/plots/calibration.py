@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator
 from scipy import stats
 
@@ -59,11 +57,7 @@ def plot_calibration(calibration: Calibration, parameters: Sequence[str] | None 
         if axes.xaxis.get_tick_params()["labelbottom"]:
             axes.set_xlabel(f"rank among {calibration.draws} draws")
     figure.supylabel("data sets", fontsize=7.5)
-    style.legend_above(figure, [
-        Patch(color=style.SKY, label="data sets"),
-        Patch(color=_BAND, label="99% if calibrated"),
-        Line2D([], [], color=style.GREY, lw=0.8, label="expected"),
-    ])
+    style.legend_above(figure)
     if note:
         style.note_below(figure, note)
     return figure
@@ -73,9 +67,9 @@ def _draw(axes: Axes, rank: np.ndarray, draws: int, bins: int) -> None:
     edges = np.linspace(-0.5, draws + 0.5, bins + 1)
     counts, _ = np.histogram(rank, edges)
     low, high = stats.binom.ppf([0.005, 0.995], len(rank), 1.0 / bins)
-    axes.axhspan(low, high, color=_BAND, lw=0, zorder=0)
-    axes.stairs(counts, edges, fill=True, color=style.SKY, alpha=0.75, zorder=1)
-    axes.axhline(len(rank) / bins, color=style.GREY, lw=0.8, zorder=2)
+    axes.axhspan(low, high, color=_BAND, lw=0, zorder=0, label="99% if calibrated")
+    axes.stairs(counts, edges, fill=True, color=style.SKY, alpha=0.75, zorder=1, label="data sets")
+    axes.axhline(len(rank) / bins, color=style.GREY, lw=0.8, zorder=2, label="expected")
     axes.set_xlim(edges[0], edges[-1])
     axes.xaxis.set_major_locator(FixedLocator([0, (draws + 1) // 2, draws]))
     axes.set_ylim(0, 1.1 * max(high, counts.max()))

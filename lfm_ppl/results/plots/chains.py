@@ -25,9 +25,7 @@ MAX_ROWS = 8
 
 
 @style.styled
-def plot_trace(
-    result: Any, parameters: Sequence[str] | None = None, *, width: str | float = "column"
-) -> Figure:
+def plot_trace(result: Any, parameters: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
     """Draw the trace and the ranks of each scalar parameter, side by side.
 
     Left, every chain over its draws, divergent transitions marked at the bottom, and the true value
@@ -58,9 +56,7 @@ def plot_trace(
     truth, units, diverging = known_truth(result), parameter_units(result), divergences(result)
     narrow = style.is_narrow(width)
     figure = style.new_figure(width, (0.82 if narrow else 0.95) * len(labels) + 0.75)
-    rows = figure.subplots(
-        len(labels), 2, squeeze=False, sharex="col", gridspec_kw={"width_ratios": [1.6, 1.0]}
-    )
+    rows = figure.subplots(len(labels), 2, squeeze=False, sharex="col", gridspec_kw={"width_ratios": [1.6, 1.0]})
     for (trace, ranks), label in zip(rows, labels, strict=True):
         for axes in (trace, ranks):
             style.tidy(axes, y_ticks=3)
@@ -75,7 +71,7 @@ def plot_trace(
         for chain, colour in enumerate(_colours(len(next(iter(draws.values())))))
     ][: len(style.CHAIN_COLOURS)]
     if any(label in truth for label in labels):
-        handles.append(Line2D([], [], color=style.BLACK, lw=0.9, ls=(0, (4, 2)), label="truth"))
+        handles.append(Line2D([], [], **style.TRUTH))
     if diverging.any():
         handles.append(Line2D([], [], ls="", label="divergent", **_DIVERGENT))
     style.legend_above(figure, handles)
@@ -139,11 +135,9 @@ def _draw_trace(axes: Axes, draws: np.ndarray, diverging: np.ndarray, truth: flo
         axes.plot(values, color=colour, lw=0.4, alpha=0.8, rasterized=draws.size > 2000)
     positions = np.flatnonzero(diverging.any(axis=0))
     if len(positions):
-        axes.plot(
-            positions, np.full(len(positions), 0.05), ls="", transform=axes.get_xaxis_transform(), **_DIVERGENT
-        )
+        axes.plot(positions, np.full(len(positions), 0.05), ls="", transform=axes.get_xaxis_transform(), **_DIVERGENT)
     if truth is not None:
-        axes.axhline(truth, color=style.BLACK, lw=0.9, ls=(0, (4, 2)))
+        axes.axhline(truth, **style.TRUTH)
     axes.set_xlim(-0.01 * count, 1.01 * count)
 
 
@@ -164,6 +158,4 @@ def _draw_ranks(axes: Axes, draws: np.ndarray) -> None:
     axes.set_ylim(0, chains)
     axes.set_ylabel("chain")
     step = -(-chains // 4)
-    axes.set_yticks(
-        np.arange(0, chains, step) + scale / 2, [str(c) for c in range(0, chains, step)]
-    )
+    axes.set_yticks(np.arange(0, chains, step) + scale / 2, [str(c) for c in range(0, chains, step)])

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from lfm_ppl.results.inputs import FORECAST, input_unit, inputs_of, time_origin, time_unit
-from lfm_ppl.results.plots import style
-from lfm_ppl.results.plots.trajectories import END, MAX_PANELS, forecast_span
+from lfm_ppl.results.plots import forecasts, style
+from lfm_ppl.results.plots.trajectories import MAX_PANELS
 from lfm_ppl.utils.checks import unknown
 
 _MANY = 150  # values, from which they have no marks
@@ -53,27 +52,23 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
             raise ValueError(unknown("input", name, list(tables)))
     names, note = style.first_of(selected, inputs, MAX_PANELS, "inputs")
     figure, panels = style.small_multiples(width, len(names), 1.25)
-    line: dict[str, Any] = {"color": style.PURPLE, "mew": 0}
-    held: dict[str, Any] = {"color": style.PURPLE, "ls": "--"}
-    last, end = forecast_span(result)
-    drawn_on = False
+    _, end = forecasts.forecast_span(result)
     for axes, name in zip(panels, names, strict=True):
         table = tables[name]
         draw_style = "steps-post" if table.interpolation == "previous" else "default"
         marker = "o" if len(table.times) <= _MANY else ""
-        axes.plot(table.times, table.values, drawstyle=draw_style, marker=marker, ms=2.2, **line)
+        axes.plot(table.times, table.values, drawstyle=draw_style, marker=marker, ms=2.2, color=style.PURPLE, mew=0,
+                  label="known input")
         if table.times[-1] < end:
-            axes.plot([table.times[-1], end], np.repeat(table.values[-1], 2), **held)
-            drawn_on = True
-        if last < end:
-            axes.axvline(last, **END)
+            axes.plot([table.times[-1], end], np.repeat(table.values[-1], 2), color=style.PURPLE, ls="--",
+                      label="held beyond its table")
+        forecasts.mark_last_observation(axes, result)
         style.label_values(axes, name, input_unit(result, name))
+    if window := forecasts.forecast_window(result):
+        panels[0].set_xlim(window)
     style.label_time(panels, time_unit(result), time_origin(result))
     figure.align_ylabels(panels)
-    handles = [Line2D([], [], label="known input", **line)]
-    handles += [Line2D([], [], label="held beyond its table", **held)] if drawn_on else []
-    handles += [Line2D([], [], label="last observation", **END)] if last < end else []
-    style.legend_above(figure, handles)
+    style.legend_above(figure)
     if note:
         style.note_below(figure, note)
     return figure

@@ -1,7 +1,7 @@
 """Figure of the joint posterior: scatter plots of every pair of scalar parameters.
 
 1. Histograms of the marginals on the diagonal, scatter plots below it.
-2. Divergent draws and the truth are marked; axes share their labels along rows and columns.
+2. Divergent draws and the truth are marked; a name on the diagonal holds for its row and its column.
 """
 
 from __future__ import annotations
@@ -12,9 +12,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.plots.chains import (
@@ -29,13 +27,12 @@ MAX_POINTS = 2000
 
 
 @style.styled
-def plot_pairs(
-    result: Any, parameters: Sequence[str] | None = None, *, width: str | float = "full"
-) -> Figure:
+def plot_pairs(result: Any, parameters: Sequence[str] | None = None, *, width: str | float = "full") -> Figure:
     """Draw every pair of scalar parameters against each other, and their marginals.
 
-    Below the diagonal are the draws (2,000 of them at most), on it the histogram of each parameter.
-    Divergent transitions stand out, and true values are drawn as lines where they are known.
+    Below the diagonal are the draws (2,000 of them at most), on it the histogram of each parameter under its name,
+    which holds for the column below and for the row to the left. Divergent transitions stand out, and true values are
+    drawn as lines where they are known.
 
     Args:
         result: with the group posterior; sample_stats and truth where there are any.
@@ -85,24 +82,15 @@ def plot_pairs(
                 _draw_pair(axes, flat[column], flat[row], diverging, lines)
     for index, label in enumerate(labels):
         bottom, left_axes = grid[count - 1, index], grid[index, 0]
-        _name_axis(bottom.xaxis, label, units.get(label, ""), panel)
+        unit = f"{style.scale(bottom.xaxis)} {units.get(label, '')}".strip()
         if index:
-            _name_axis(left_axes.yaxis, label, units.get(label, ""), panel)
-    figure.align_labels()
-    _legend(figure, bool(diverging.any()), any(label in truth for label in labels))
+            left_axes.yaxis.set_major_formatter(bottom.xaxis.get_major_formatter())
+        _write_above(grid[index, index], f"{label} ({unit})" if unit else label, float(2 * index >= count))
+    if diverging.any() or any(label in truth for label in labels):
+        style.legend_above(figure)
     if note:
         style.note_below(figure, note)
     return figure
-
-
-_DIVERGENT: dict[str, Any] = {
-    "color": style.VERMILLION,
-    "ls": "",
-    "marker": "D",
-    "ms": 2.4,
-    "mew": 0,
-}
-_TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.8, "ls": (0, (4, 2))}
 
 
 def _tidy(axes: Axes, y_labels: bool, x_labels: bool, panel: float) -> None:
@@ -118,7 +106,7 @@ def _draw_marginal(axes: Axes, values: np.ndarray, truth: float | None) -> None:
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
     if truth is not None:
-        axes.axvline(truth, **_TRUTH)
+        axes.axvline(truth, **style.TRUTH)
 
 
 def _draw_pair(
@@ -130,32 +118,19 @@ def _draw_pair(
 ) -> None:
     # Evenly thinned draws look like all of them; divergences are rare and are all drawn.
     thinned = slice(None, None, -(-x.size // MAX_POINTS))
-    axes.plot(
-        x[thinned], y[thinned], color=style.BLUE, ls="", marker="o", ms=1.6, mew=0, alpha=0.35,
-        rasterized=True,
-    )  # fmt: skip
+    axes.plot(x[thinned], y[thinned], color=style.BLUE, ls="", marker="o", ms=1.6, mew=0, alpha=0.35, rasterized=True,
+              label="draw")
     if diverging.any():
-        axes.plot(x[diverging], y[diverging], **_DIVERGENT)
+        axes.plot(x[diverging], y[diverging], color=style.VERMILLION, ls="", marker="D", ms=2.4, mew=0,
+                  label="divergent")
     if truth[0] is not None:
-        axes.axvline(truth[0], **_TRUTH)
+        axes.axvline(truth[0], **style.TRUTH)
     if truth[1] is not None:
-        axes.axhline(truth[1], **_TRUTH)
+        axes.axhline(truth[1], **style.TRUTH)
 
 
-def _legend(figure: Figure, diverging: bool, truth: bool) -> None:
-    handles = [
-        Line2D([], [], color=style.BLUE, ls="", marker="o", ms=3, mew=0, label="draw"),
-    ]
-    if diverging:
-        handles.append(Line2D([], [], label="divergent", **_DIVERGENT))
-    if truth:
-        handles.append(Line2D([], [], label="truth", **_TRUTH))
-    if len(handles) > 1:
-        style.legend_above(figure, handles)
-
-
-def _name_axis(axis: Axis, label: str, unit: str, panel: float) -> None:
-    room = int(panel / 0.062)  # characters along the side of a panel
-    unit = f"{style.scale(axis)} {unit}".strip()
-    lines = style.wrapped(label, room) + ([f"({unit})"] if unit else [])
-    axis.set_label_text("\n".join(lines), fontsize=style.SMALL)
+def _write_above(axes: Axes, text: str, side: float) -> None:
+    """Write a text of any length above ``axes``, from its left edge (0) on or up to its right edge (1)."""
+    axes.set_title(" ")  # the layout leaves room for the height of a title; the width would push panels apart
+    name = axes.text(side, 1.03, text, transform=axes.transAxes, ha="right" if side else "left", va="bottom")
+    name.set_in_layout(False)

@@ -17,8 +17,6 @@ import pandas as pd
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from lfm_ppl.results.arviz_data import group
@@ -38,9 +36,7 @@ _ENVELOPE = "#DDDDDD"
 
 
 @style.styled
-def plot_residuals(
-    result: Any, outputs: Sequence[str] | None = None, *, width: str | float = "column"
-) -> Figure:
+def plot_residuals(result: Any, outputs: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
     """Draw the standardised one-step-ahead residuals of each output in three panels.
 
     Over time: posterior means, with the 95% interval over the draws as a thin bar, and the lines
@@ -82,13 +78,7 @@ def plot_residuals(
     for row in rows if style.is_narrow(width) else rows[-1:]:
         row[1].set_xlabel("normal quantile")
         row[2].set_xlabel("lag (observations)")
-    style.legend_above(
-        figure,
-        [
-            Line2D([], [], color=style.BLUE, ls="", marker="o", ms=2.6, label="posterior mean"),
-            Patch(color=_ENVELOPE, label="95% if the model holds"),
-        ],
-    )
+    style.legend_above(figure)
     if note:
         style.note_below(figure, note)
     return figure
@@ -115,7 +105,7 @@ def _panels(width: str | float, count: int) -> tuple[Figure, list[tuple[Axes, Ax
 
 def _draw_over_time(axes: Axes, series: xr.DataArray, draws: xr.DataArray) -> None:
     times = series["time"].values
-    axes.axhspan(-1.96, 1.96, color=_ENVELOPE, lw=0, zorder=0)
+    axes.axhspan(-1.96, 1.96, color=_ENVELOPE, lw=0, zorder=0, label="95% if the model holds")
     axes.axhline(0.0, color=style.GREY, lw=0.6, zorder=1)
     reach = max(3.0, 1.1 * np.nanmax(np.abs(series.values), initial=0.0))
     if len(times) <= 200:
@@ -123,7 +113,7 @@ def _draw_over_time(axes: Axes, series: xr.DataArray, draws: xr.DataArray) -> No
         axes.vlines(times, *bounds, color=style.SKY, lw=0.8, zorder=2)
         reach = max(reach, 1.05 * np.nanmax(np.abs(bounds), initial=0.0))
     size = 2.6 if len(times) <= 150 else 1.2
-    axes.plot(times, series, color=style.BLUE, ls="", marker="o", ms=size, mew=0, zorder=3)
+    axes.plot(times, series, color=style.BLUE, ls="", marker="o", ms=size, mew=0, zorder=3, label="posterior mean")
     pad = 0.03 * (times[-1] - times[0]) or 0.5
     axes.set_xlim(times[0] - pad, times[-1] + pad)  # the same for all outputs, missing or not
     axes.set_ylim(-reach, reach)
@@ -147,10 +137,8 @@ def _draw_autocorrelation(axes: Axes, series: np.ndarray, test: pd.Series) -> No
     rho, pairs = autocorrelation(series, lags) if count > 1 else (np.full(lags, np.nan), None)
     lag = np.arange(1, lags + 1)
     if pairs is not None:
-        bound = 1.96 / np.sqrt(np.maximum(pairs, 1))
-        axes.stairs(
-            bound, np.arange(lags + 1) + 0.5, baseline=-bound, fill=True, color=_ENVELOPE, zorder=0
-        )
+        bound = 1.96 / np.sqrt(np.where(pairs, pairs, np.nan))
+        axes.stairs(bound, np.arange(lags + 1) + 0.5, baseline=-bound, fill=True, color=_ENVELOPE, zorder=0)
         axes.vlines(lag, 0.0, rho, color=style.BLUE, lw=1.4, zorder=2)
     axes.axhline(0.0, color=style.GREY, lw=0.6, zorder=1)
     reach = max(0.6, 1.1 * np.nanmax(np.abs(rho), initial=0.0))

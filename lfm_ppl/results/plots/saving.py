@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import functools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -13,12 +13,16 @@ from matplotlib.figure import Figure
 
 from lfm_ppl.results.arviz_data import group, has_group, of_mode
 from lfm_ppl.results.inputs import inputs_of
-from lfm_ppl.results.plots import accuracy, chains, inputs, pairs, residuals, style, trajectories
+from lfm_ppl.results.plots import accuracy, chains, forecasts, inputs, pairs, residuals, trajectories
 from lfm_ppl.results.scalars import sampled
 from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
 
 MAX_PAGES = 5
 Draw = Callable[..., Figure]
+_OVER_TIME: dict[str, Draw] = {
+    "fit": trajectories.plot_fit, "inputs": inputs.plot_inputs, "forces": trajectories.plot_forces,
+    "deterministics": trajectories.plot_deterministics, "states": trajectories.plot_states,
+}
 
 
 def save_figures(
@@ -32,8 +36,9 @@ def save_figures(
     """Draw every figure that ``result`` has the groups for, and write it to ``folder``.
 
     The figures are fit, inputs, forces, deterministics, states, trace (not of sampler "map", which has no chains),
-    pairs, residuals and accuracy. What does not fit on one page goes to numbered ones, such as ``trace-1.png`` and
-    ``trace-2.png``, five at most. Every file is written under a temporary name and renamed.
+    pairs, residuals and accuracy. A forecast that was made after the fit has its own: forecast, forecast-inputs and so
+    on. What does not fit on one page goes to numbered ones, such as ``trace-1.png`` and ``trace-2.png``, five at most.
+    Every file is written under a temporary name and renamed.
 
     Args:
         result: an ArviZ object.
@@ -75,26 +80,22 @@ def save_figures(
         figure.set_layout_engine("none")  # laid out already; each format would do it again
         for ending in formats:
             with atomic_write(Path(folder) / f"{name}.{ending}", overwrite) as temporary:
-                with style.in_style():
-                    figure.savefig(temporary, format=ending)
+                figure.savefig(temporary, format=ending)
     return paths
 
 
 def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[str] | None]]:
     """Yield file name, function and the names to draw, for each page of each figure."""
-    for kind, draw in (
-        ("output", trajectories.plot_fit),
-        ("force", trajectories.plot_forces),
-        ("deterministic", trajectories.plot_deterministics),
-        ("state", trajectories.plot_states),
-    ):
-        names = trajectories.trajectory_names(result, kind)
-        if kind == "output" and not has_group(result, "observed_data"):
-            continue
-        title = "fit" if kind == "output" else f"{kind}s"
-        yield from _numbered(title, draw, names, trajectories.MAX_PANELS)
-        if kind == "output" and (input_names := list(inputs_of(result))):
-            yield from _numbered("inputs", inputs.plot_inputs, input_names, trajectories.MAX_PANELS)
+    later = forecasts.is_made_later(result)
+    for prefix in ("", "forecast-") if later else ("",):
+        for kind, draw in _OVER_TIME.items():
+            names = (list(inputs_of(result)) if kind == "inputs" else
+                     trajectories.trajectory_names(result, "output" if kind == "fit" else kind.removesuffix("s")))
+            if kind == "fit" and not has_group(result, "observed_data"):
+                continue
+            title = f"{prefix}{kind}".replace("forecast-fit", "forecast")
+            yield from _numbered(title, draw if prefix or not later else _of_the_fit(draw), names,
+                                 trajectories.MAX_PANELS)
     if has_group(result, "posterior"):
         labels = sampled(group(result, "posterior"))
         if not of_mode(result):  # independent draws have no chains to look at
@@ -111,10 +112,18 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[
         yield "accuracy", accuracy.plot_accuracy, None
 
 
-def _numbered(
-    title: str, draw: Draw, names: list[str], size: int
-) -> Iterator[tuple[str, Draw, list[str]]]:
-    pages = [list(page) for page in _batches(names, size)]
+def _of_the_fit(draw: Draw) -> Draw:
+    """Return the function of a figure without the forecast, which has figures of its own."""
+
+    @functools.wraps(draw)
+    def wrapper(result: Any, *args: Any, **kwargs: Any) -> Figure:
+        return draw(forecasts.without_forecast(result), *args, **kwargs)
+
+    return wrapper
+
+
+def _numbered(title: str, draw: Draw, names: list[str], size: int) -> Iterator[tuple[str, Draw, list[str]]]:
+    pages = [names[start:start + size] for start in range(0, len(names), size)]
     if len(pages) > MAX_PAGES:
         warnings.warn(
             f"{title}: drawing the first {MAX_PAGES * size} of {len(names)}; call "
@@ -123,9 +132,3 @@ def _numbered(
         )
     for number, page in enumerate(pages[:MAX_PAGES], start=1):
         yield (f"{title}-{number}" if len(pages) > 1 else title), draw, page
-
-
-def _batches(names: list[str], size: int) -> Iterator[tuple[str, ...]]:
-    iterator = iter(names)
-    while batch := tuple(itertools.islice(iterator, size)):
-        yield batch

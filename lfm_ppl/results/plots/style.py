@@ -35,11 +35,13 @@ BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
 GREY = "#707070"
 CHAIN_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK, YELLOW)
+TRUTH: dict[str, Any] = {"color": BLACK, "lw": 0.9, "ls": (0, (4, 2)), "zorder": 3.5, "label": "truth"}
 
 _SHARED = ("%d %b %Y", "%b %Y", "%Y")
 """What the ticks of an axis of dates may share, which then stands once beside it: the day, the month or the year."""
 
 SMALL = 7.0
+_ROOM = 18  # characters along the side of a panel
 STYLE = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
@@ -53,6 +55,7 @@ STYLE = {
     "legend.frameon": False,
     "legend.handlelength": 1.4,
     "legend.columnspacing": 1.2,
+    "legend.markerscale": 1.5,
     "xtick.labelsize": SMALL,
     "ytick.labelsize": SMALL,
     "axes.linewidth": 0.6,
@@ -72,6 +75,11 @@ P = ParamSpec("P")
 
 class Drawing(Figure):
     """A figure outside pyplot, which a notebook shows once and nothing keeps in memory."""
+
+    def savefig(self, *args: Any, **kwargs: Any) -> None:
+        """Save the figure in our style, whose resolution is that of print."""
+        with in_style():
+            super().savefig(*args, **kwargs)
 
     def _repr_png_(self) -> bytes:
         with io.BytesIO() as buffer:
@@ -160,35 +168,32 @@ def scale(axis: Axis) -> str:
     """
     largest = max(map(abs, axis.get_view_interval()))
     power = math.floor(math.log10(largest)) if largest > 0 and math.isfinite(largest) else 0
-    if -2 <= power <= 3:
+    if -2 <= power <= 4:
         power = 0
     axis.set_major_formatter(PlainNumbers(power))
     raised = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"10{raised}" if power else ""
 
 
-def small_multiples(width: str | float, count: int, height: float) -> tuple[Figure, list[Axes]]:
-    """Return a figure of ``count`` panels over one common x axis.
+def small_multiples(width: str | float, count: int, height: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:
+    """Return a figure of ``count`` panels, and its axes row by row.
 
     Args:
         width: of the figure.
         count: number of panels, at least one.
         height: of a panel, in inches.
-
-    Returns:
-        The figure, and its axes row by row. Only the lowest panel of a column shows tick labels.
+        sharex: whether the panels have a common x axis, whose tick labels only the lowest panel of a column shows.
     """
     limits = (3, 2) if is_narrow(width) else (4, 3)
     columns = 1 if is_narrow(width) and count <= limits[0] else min(count, limits[1])
     rows = math.ceil(count / columns)
-    figure = new_figure(width, height * rows + 0.55)
-    grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
-    panels = list(grid.flat)
+    figure = new_figure(width, (height if sharex else height + 0.3) * rows + 0.55)
+    panels = list(figure.subplots(rows, columns, sharex=sharex, squeeze=False).flat)
     for spare in panels[count:]:
         spare.remove()
     for index, axes in enumerate(panels[:count]):
         tidy(axes)
-        axes.tick_params(labelbottom=index + columns >= count)
+        axes.tick_params(labelbottom=not sharex or index + columns >= count)
     return figure, panels[:count]
 
 
@@ -280,12 +285,28 @@ def label_time(panels: Sequence[Axes], unit: str, origin: str = "") -> None:
 
 
 def label_values(axes: Axes, name: str, unit: str) -> None:
-    """Write ``name (unit)`` along the y axis."""
-    axes.set_ylabel(with_unit(name, f"{scale(axes.yaxis)} {unit}".strip()))
+    """Write ``name (unit)`` along the y axis; a name too long for it stands above the panel."""
+    unit = f"{scale(axes.yaxis)} {unit}".strip()
+    if max(map(len, wrapped(name, _ROOM))) > _ROOM:
+        axes.set_title(name)
+        axes.set_ylabel(unit)
+    else:
+        axes.set_ylabel(with_unit(name, unit))
 
 
-def legend_above(figure: Figure, handles: Sequence[Any]) -> None:
-    """Put one legend for all panels on top of ``figure``, in as many rows as it needs."""
+def legend_above(figure: Figure, handles: Sequence[Any] = ()) -> None:
+    """Put one legend for all panels on top of ``figure``, in as many rows as it needs.
+
+    Args:
+        figure: the figure.
+        handles: entries of the legend; empty: each label of the artists in any panel once.
+    """
+    if not handles:
+        by_label: dict[str, Any] = {}
+        for axes in figure.axes:
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                by_label.setdefault(label, handle)
+        handles = list(by_label.values())
     for rows in range(1, len(handles) + 1):
         columns = math.ceil(len(handles) / rows)
         legend = figure.legend(handles=handles, loc="outside upper center", ncols=columns)
@@ -300,26 +321,22 @@ def note_below(figure: Figure, text: str) -> None:
     figure.supxlabel("\n".join(lines), fontsize=SMALL, color=GREY)
 
 
-def with_unit(name: str, unit: str, room: int = 18) -> str:
-    """Return ``name (unit)``, in lines of ``room`` characters at most where it can be broken."""
+def with_unit(name: str, unit: str, room: int = _ROOM) -> str:
+    """Return ``name (unit)``, in lines of ``room`` characters where spaces and brackets allow it."""
     if unit and len(name) + len(unit) + 3 <= room:
         return f"{name} ({unit})"
     return "\n".join([*wrapped(name, room), f"({unit})"] if unit else wrapped(name, room))
 
 
 def wrapped(name: str, room: int) -> list[str]:
-    """Break a name such as ``basal_rate[CDKN1A]`` before brackets and after underscores."""
-    lines = [""]
-    for piece in re.findall(r"\[[^_]*_?|[^_\[]+_?|_", name):
-        if lines[-1] and len(lines[-1]) + len(piece) > room:
-            lines.append("")
-        lines[-1] += piece
-    return [part for line in lines for part in textwrap.wrap(line, room)]
+    """Break a name such as ``basal_rate[CDKN1A]`` before brackets and at spaces."""
+    if len(name) <= room:
+        return [name]
+    return [line for piece in re.findall(r"\[[^\[]*|[^\[]+", name)
+            for line in textwrap.wrap(piece, room, break_long_words=False, break_on_hyphens=False)]
 
 
-def first_of(
-    names: Sequence[str], selection: Sequence[str] | None, limit: int, argument: str
-) -> tuple[list[str], str]:
+def first_of(names: Sequence[str], selection: Sequence[str] | None, limit: int, argument: str) -> tuple[list[str], str]:
     """Cut ``names`` to ``limit`` unless the caller chose them, and say what was left out.
 
     Returns:

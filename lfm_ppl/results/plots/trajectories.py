@@ -1,53 +1,46 @@
 """Figures over time: the fit to the data, the forces, the states.
 
-1. Select the trajectories of one kind, and their predictions.
+1. Select the trajectories of one kind, and their predictions; beside a short forecast, the last rows only.
 2. Draw the mean and the 95% band, from the mixture over the draws if it is stored, else from the draws.
 3. Draw forecasts after the last observation, missing values, held-out data and the truth.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from lfm_ppl.results.arviz_data import group, has_group
 from lfm_ppl.results.inputs import time_origin, time_unit
-from lfm_ppl.results.plots import style
-from lfm_ppl.results.predictions import GROUP, HELD_OUT, INTERVAL, MEAN, interval, noise_free_interval, quantiles
+from lfm_ppl.results.plots import forecasts, style
+from lfm_ppl.results.predictions import INTERVAL, PERIODS, SHOWN_PERIODS, quantiles, repeats_often
 from lfm_ppl.results.scalars import unit_of
 from lfm_ppl.utils.checks import unknown
 
 MAX_PANELS = 12
 _MANY = 150  # measurements
-_BARS = 12  # forecasts from which they are drawn as bands
-END: dict[str, Any] = {"color": style.GREY, "lw": 0.8, "ls": (0, (1, 2)), "zorder": 2.5}
-_TRUTH: dict[str, Any] = {"color": style.BLACK, "lw": 0.9, "ls": (0, (4, 2)), "zorder": 3.5}
-_HELD_OUT: dict[str, Any] = {"color": style.BLACK, "ls": "", "marker": "o", "ms": 2.6, "mfc": "white", "mew": 0.6,
-                             "zorder": 4}
-_NOISE_FREE, _PREDICTIVE, _FORCE, _DETERMINISTIC = "#8FBFDE", "#D3E4F1", "#9AD3C1", "#F3CFA3"
+_FORCE, _DETERMINISTIC = "#9AD3C1", "#F3CFA3"
 """Tints of the line colours."""
 
 
 @style.styled
-def plot_fit(
-    result: Any, outputs: Sequence[str] | None = None, *, width: str | float = "column"
-) -> Figure:
+def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
     """Draw the data of each output with the posterior of what was measured, and forecasts of it.
 
     The inner band holds 95% of the noise-free output, the outer one 95% of new measurements. Where the
     result has predictions, both go on after the last observation, which a dotted line marks, and the outer
-    band is theirs; forecasts at fewer than 12 times are drawn as bars. Bands follow the summaries that the
+    band is theirs; forecasts at fewer than 40 times are drawn as bars. Of a forecast that was made after the fit and
+    would fill less than a fifth of the axis, the figure shows the last rows only. Bands follow the summaries that the
     trajectories hold; where they hold draws alone, they are quantiles of these, and the outer one ends with the data:
     it is exact at the measurement times, and between them the inner one widened by the difference of the two,
-    interpolated linearly. Replicates are pooled. Of simulated data the noise-free truth is drawn, too.
+    interpolated linearly; of counts it is a step at each time. Replicates are pooled. Of simulated data the noise-free
+    truth is drawn, too.
 
     Args:
         result: with the groups observed_data and trajectories, posterior_predictive for the outer band, predictions for
@@ -57,7 +50,7 @@ def plot_fit(
         width: "column" (3.4 in), "full" (7 in), or inches.
 
     Returns:
-        A figure with one panel per output. Missing values are marked above the time axis.
+        A figure with one panel per output. Ticks at the top of a panel mark the times of missing values.
 
     Raises:
         ValueError: a group is missing, or an output is unknown.
@@ -74,70 +67,23 @@ def plot_fit(
         >>> figure.axes[0].get_ylabel()
         'mRNA (nM)'
     """
+    result, remark = forecasts.recent_part(result)
     observed = group(result, "observed_data")["y"].transpose("time", "output")
-    predictive = _predictive(result)
-    predicted = _predicted(result)
-    alone = predicted is not None and not has_group(result, "trajectories")
-    noise_free = None if alone else _trajectories(result, "output")
-    inner = None if noise_free is None else _summary(result, "outputs")
-    new = None if noise_free is None else _summary(result, "new_data")
-    later = group(result, HELD_OUT)["y"] if has_group(result, HELD_OUT) else None
-    truth = _true(result, "output")
-    has_truth, (last, end) = False, forecast_span(result)
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
     figure, panels = style.small_multiples(width, len(names), 1.35)
     for axes, name in zip(panels, names, strict=True):
-        data = observed.sel(output=name)
-        covered = predicted is not None and (noise_free is None or
-                                             _covers(predicted["time"].values, noise_free["at"].values))
-        if predicted is not None and covered and inner is None:
-            _draw_forecast(axes, predicted.sel(output=[name]))
-        else:
-            time, mean, low, high = _band(result, "output", name)
-            if new is not None:
-                axes.fill_between(time, *new.sel(output=name).values[1:], color=_PREDICTIVE, lw=0, zorder=1)
-            elif predicted is not None and covered:
-                axes.fill_between(*_noisy_band(predicted.sel(output=[name])), color=_PREDICTIVE, lw=0, zorder=1)
-            elif predictive is not None:
-                outer = _widened(predictive.sel(output=name), time, low, high)
-                axes.fill_between(*outer, color=_PREDICTIVE, lw=0, zorder=1)
-            axes.fill_between(time, low, high, color=_NOISE_FREE, lw=0, zorder=2)
-            axes.plot(time, mean, color=style.BLUE, zorder=3)
-            if predicted is not None and not covered:
-                wide = (low[-1], high[-1]) if new is None else new.sel(output=name).values[1:, -1]
-                _draw_forecast(axes, predicted.sel(output=[name]).isel(time=predicted["time"].values >= time[-1]),
-                               (time[-1], mean[-1], *wide, low[-1], high[-1]))
-        if last < end:
-            axes.axvline(last, **END)
-        has_truth |= _draw_truth(axes, truth, "output", name)
-        _draw_data(axes, data)
-        if later is not None:
-            axes.plot(later["time"], later.sel(output=name), **_HELD_OUT)
+        _draw_output(axes, result, name)
+        forecasts.mark_last_observation(axes, result)
+        _draw_truth(axes, result, "output", name)
+        _draw_data(axes, observed.sel(output=name))
+        forecasts.draw_held_out(axes, result, name)
         style.label_values(axes, name, unit_of(observed, name))
-    style.label_time(panels, time_unit(result), time_origin(result))
-    figure.align_ylabels(panels)
-    handles: list[Artist] = [Line2D([], [], label="data", **_data_style(observed.sizes["time"]))]
-    handles += [Line2D([], [], label="held-out data", **_HELD_OUT)] if later is not None else []
-    handles += [Line2D([], [], color=style.BLUE, label="posterior mean")]
-    handles += [Patch(color=_NOISE_FREE, label="95%, noise-free")]
-    if new is not None or predictive is not None or predicted is not None:
-        handles += [Patch(color=_PREDICTIVE, label="95%, new data")]
-    if has_truth:
-        handles += [Line2D([], [], label="truth", **_TRUTH)]
-    if last < end:
-        handles += [Line2D([], [], label="last observation", **END)]
-    if np.isnan(observed.sel(output=names)).any():
-        handles += [Line2D([], [], label="missing", **_missing_style(observed.sizes["time"]))]
-    style.legend_above(figure, handles)
-    if note:
-        style.note_below(figure, note)
+    _finish(figure, panels, result, f"{remark} {note}")
     return figure
 
 
 @style.styled
-def plot_forces(
-    result: Any, forces: Sequence[str] | None = None, *, width: str | float = "column"
-) -> Figure:
+def plot_forces(result: Any, forces: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
     """Draw the posterior mean of each force with a 95% band, the forecast of it, and the truth where they are known.
 
     Args:
@@ -160,13 +106,11 @@ def plot_forces(
         >>> [axes.get_ylabel() for axes in figure.axes]
         ['p53']
     """
-    return _panels(result, "force", forces, width, (style.GREEN, _FORCE))
+    return _draw_kind(result, "force", forces, width, (style.GREEN, _FORCE))
 
 
 @style.styled
-def plot_states(
-    result: Any, states: Sequence[str] | None = None, *, width: str | float = "column"
-) -> Figure:
+def plot_states(result: Any, states: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
     """Draw the posterior mean of each state with a 95% band, the forecast of it, and the truth where they are known.
 
     Args:
@@ -188,13 +132,11 @@ def plot_states(
         >>> [axes.get_ylabel() for axes in plot_states(build({"trajectories": draws})).axes]
         ['x', 'v']
     """
-    return _panels(result, "state", states, width, (style.BLUE, _NOISE_FREE))
+    return _draw_kind(result, "state", states, width, (style.BLUE, forecasts.NOISE_FREE))
 
 
 @style.styled
-def plot_deterministics(
-    result: Any, names: Sequence[str] | None = None, *, width: str | float = "column"
-) -> Figure:
+def plot_deterministics(result: Any, names: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
     """Draw the posterior mean of what follows from states and forces with a 95% band, its forecast, and its truth.
 
     Args:
@@ -216,7 +158,7 @@ def plot_deterministics(
         >>> [axes.get_ylabel() for axes in plot_deterministics(build({"trajectories": draws})).axes]
         ['uptake']
     """
-    return _panels(result, "deterministic", names, width, (style.ORANGE, _DETERMINISTIC))
+    return _draw_kind(result, "deterministic", names, width, (style.ORANGE, _DETERMINISTIC))
 
 
 def trajectory_names(result: Any, kind: str) -> list[str]:
@@ -240,47 +182,48 @@ def pick(variable: xr.DataArray, kind: str, selection: Sequence[str] | None) -> 
     return selection
 
 
-def _panels(
-    result: Any,
-    kind: str,
-    selection: Sequence[str] | None,
-    width: str | float,
-    colours: tuple[str, str],
-) -> Figure:
+def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, width: str | float,
+               colours: tuple[str, str]) -> Figure:
+    """Draw a panel for each force, state or deterministic, its mean and band in the two ``colours``."""
+    result, remark = forecasts.recent_part(result)
     draws = _trajectories(result, kind)
-    truth = _true(result, kind)
     names, note = style.first_of(pick(draws, kind, selection), selection, MAX_PANELS, f"{kind}s")
-    figure, panels = style.small_multiples(width, len(names), 1.25)
-    line, tint = colours
-    has_truth = False
-    predicted = _predicted(result)
-    forecast = None if predicted is None else predicted.get(f"{kind}s")
-    last, end = forecast_span(result)
-    later = forecast is not None and last < end
+    predicted = forecasts.series_predictions(result)
+    paths = None if predicted is None else predicted.get(f"{kind}s")
+    starts = _first_shown(draws, forecasts.forecast_span(result)[1])
+    figure, panels = style.small_multiples(width, len(names), 1.25, sharex=not set(starts) & set(names))
     for axes, name in zip(panels, names, strict=True):
-        time, mean, low, high = _band(result, kind, name)
-        axes.fill_between(time, low, high, color=tint, lw=0, zorder=1)
-        axes.plot(time, mean, color=line, zorder=2)
-        if forecast is not None and later:
-            paths = forecast.sel({kind: name, "time": forecast["time"] >= time[-1]}).transpose("chain", "draw", "time")
-            if paths.sizes["time"]:
-                flat = paths.values.reshape(-1, paths.sizes["time"])
-                curves = (paths["time"].values, flat.mean(axis=0), *np.quantile(flat, INTERVAL, axis=0))
-                _draw_ahead(axes, curves, line, (tint,), (time[-1], mean[-1], low[-1], high[-1]))
-            axes.axvline(last, **END)
-        has_truth |= _draw_truth(axes, truth, kind, name)
+        band = np.array(_band(result, kind, name))
+        time, mean, low, high = band[:, band[0] >= starts.get(name, -np.inf)]
+        axes.plot(time, mean, color=colours[0], zorder=2, label="posterior mean")
+        axes.fill_between(time, low, high, color=colours[1], lw=0, zorder=1, label="95%")
+        if paths is not None:
+            later = paths.sel({kind: name, "time": paths["time"] > time[-1]})
+            forecasts.draw_paths(axes, later, (time[-1], mean[-1], low[-1], high[-1]), *colours)
+            forecasts.mark_last_observation(axes, result)
+        _draw_truth(axes, result, kind, name)
         style.label_values(axes, name, unit_of(draws, name))
+    shortened = [name for name in names if name in starts]
+    periods = f"Of {', '.join(shortened)} the last {SHOWN_PERIODS} periods." if shortened else ""
+    _finish(figure, panels, result, f"{remark} {periods} {note}")
+    return figure
+
+
+def _first_shown(draws: xr.DataArray, end: float) -> dict[str, float]:
+    """Return the time from which each force that repeats often is shown."""
+    times = draws["at"].values
+    end = max(end, times[-1])
+    periods = json.loads(draws.attrs.get(PERIODS, "{}"))
+    return {name: end - SHOWN_PERIODS * period for name, period in periods.items()
+            if repeats_often(period, end - times[0])}
+
+
+def _finish(figure: Figure, panels: list[Axes], result: Any, remark: str) -> None:
     style.label_time(panels, time_unit(result), time_origin(result))
     figure.align_ylabels(panels)
-    handles = [Line2D([], [], color=line, label="posterior mean"), Patch(color=tint, label="95%")]
-    if has_truth:
-        handles += [Line2D([], [], label="truth", **_TRUTH)]
-    if later:
-        handles += [Line2D([], [], label="last observation", **END)]
-    style.legend_above(figure, handles)
-    if note:
-        style.note_below(figure, note)
-    return figure
+    style.legend_above(figure)
+    if remark.strip():
+        style.note_below(figure, remark)
 
 
 def _trajectories(result: Any, kind: str) -> xr.DataArray:
@@ -294,86 +237,70 @@ def _trajectories(result: Any, kind: str) -> xr.DataArray:
     return dataset[f"{kind}s"].transpose("chain", "draw", "at", kind)
 
 
-def _true(result: Any, kind: str) -> xr.DataArray | None:
-    """Return the true trajectories of a kind; None where they are not known."""
-    return group(result, "truth").get(f"{kind}s") if has_group(result, "truth") else None
-
-
-def _draw_truth(axes: Axes, truth: xr.DataArray | None, kind: str, name: str) -> bool:
-    """Draw the true trajectory where it is known, as far as the axes are in use, and return whether it is."""
+def _draw_truth(axes: Axes, result: Any, kind: str, name: str) -> None:
+    """Draw the true trajectory where it is known, as far as the axes are in use."""
+    truth = group(result, "truth").get(f"{kind}s") if has_group(result, "truth") else None
     if truth is None or kind not in truth.dims or name not in truth[kind].values:
-        return False
-    times, (low, high) = truth["at_truth"].values, axes.dataLim.intervalx
-    used = (times >= low) & (times <= high) | (low > high)  # nothing else is drawn yet
-    axes.plot(times[used], truth.sel({kind: name}).values[used], **_TRUTH)
-    return bool(used.any())
-
-
-def _predictive(result: Any) -> xr.DataArray | None:
-    if not has_group(result, "posterior_predictive"):
-        return None
-    return group(result, "posterior_predictive")["y"].transpose("chain", "draw", "time", "output")
-
-
-def _predicted(result: Any) -> xr.Dataset | None:
-    """Return the predictions of one series; None where there are none."""
-    if not has_group(result, GROUP):
-        return None
-    dataset = group(result, GROUP)
-    return None if "series" in dataset.dims else dataset.drop_duplicates("time")
-
-
-def forecast_span(result: Any) -> tuple[float, float]:
-    """Return the times of the last observation and of the last prediction; minus infinity without predictions."""
-    predicted = _predicted(result)
-    if predicted is None or predicted.sizes["time"] == 0:
-        return -np.inf, -np.inf
-    end = float(predicted["time"].values.max())
-    return float(predicted.attrs.get("last_observation", end)), end
-
-
-def _covers(times: np.ndarray, requested: np.ndarray) -> bool:
-    """Whether there are predictions all along the trajectories."""
-    return len(times) >= _BARS and bool(set(requested.tolist()) <= set(times.tolist()))
-
-
-def _noisy_band(predicted: xr.Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times and the ends of the 95% interval of new data of one output."""
-    return predicted["time"].values, *interval(predicted)[..., 0]
-
-
-def _draw_forecast(axes: Axes, predicted: xr.Dataset, start: tuple[float, ...] = ()) -> None:
-    """Draw predictions of one output, noise-free and new data; ``start`` is what they go on from."""
-    if predicted.sizes["time"] == 0:
         return
-    time, lower, upper = _noisy_band(predicted)
-    low, high = noise_free_interval(predicted)[..., 0]
-    mean = predicted[MEAN if MEAN in predicted else "outputs"].mean(["chain", "draw"]).values[:, 0]
-    _draw_ahead(axes, (time, mean, lower, upper, low, high), style.BLUE, (_PREDICTIVE, _NOISE_FREE), start)
+    times, (low, high) = truth["at_truth"].values, axes.dataLim.intervalx
+    is_shown = (times >= low) & (times <= high) | (low > high)  # nothing else is drawn yet
+    if is_shown.any():
+        axes.plot(times[is_shown], truth.sel({kind: name}).values[is_shown], **style.TRUTH)
 
 
-def _draw_ahead(axes: Axes, curves: Sequence[np.ndarray], line: str, tints: Sequence[str],
-                start: tuple[float, ...]) -> None:
-    """Draw a mean and bands, the widest first: as bars where there are few times.
+def _draw_output(axes: Axes, result: Any, name: str) -> None:
+    """Draw mean and bands of an output, and what is predicted of it."""
+    predicted = forecasts.series_predictions(result)
+    predicted = None if predicted is None else predicted.sel(output=[name])
+    if predicted is not None and not has_group(result, "trajectories"):
+        return forecasts.draw_outputs(axes, predicted)
+    time, mean, low, high = _band(result, "output", name)
+    is_covered = predicted is not None and set(time.tolist()) <= set(predicted["time"].values.tolist())
+    if is_covered and _summary(result, "outputs") is None:
+        return forecasts.draw_outputs(axes, predicted)
+    outer = _draw_new_data(axes, result, name, predicted if is_covered else None, (time, low, high))
+    axes.fill_between(time, low, high, color=forecasts.NOISE_FREE, lw=0, zorder=2, label="95%, noise-free")
+    axes.plot(time, mean, color=style.BLUE, zorder=3, label="posterior mean")
+    if predicted is not None and not is_covered:
+        later = predicted.isel(time=predicted["time"].values > time[-1])
+        forecasts.draw_outputs(axes, later, (time[-1], mean[-1], *outer, low[-1], high[-1]))
 
-    Args:
-        axes: where to.
-        curves: times, mean, and the ends of each band.
-        line: colour of the mean.
-        tints: colours of the bands.
-        start: the same numbers where the curves go on from; empty where nothing comes before.
+
+def _draw_new_data(axes: Axes, result: Any, name: str, predicted: xr.Dataset | None,
+                   inner: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[float, float]:
+    """Draw the band of new data about ``inner``, times and ends of the noise-free band; return its last ends."""
+    summary, step = _summary(result, "new_data"), None
+    if summary is not None:
+        band = inner[0], *summary.sel(output=name).values[1:]
+    elif predicted is not None:
+        band = forecasts.new_data_band(predicted)
+    elif has_group(result, "posterior_predictive"):
+        draws = group(result, "posterior_predictive")["y"].sel(output=name).transpose("chain", "draw", "time")
+        band, step = _band_of_draws(draws, *inner)
+    else:
+        return inner[1][-1], inner[2][-1]
+    axes.fill_between(*band, color=forecasts.PREDICTIVE, lw=0, zorder=1, step=step, label="95%, new data")
+    return band[1][-1], band[2][-1]
+
+
+def _band_of_draws(predictive: xr.DataArray, positions: np.ndarray, low: np.ndarray,
+                   high: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], Any]:
+    """Return times and ends of the predictive interval, from the first to the last measurement, and its kind of step.
+
+    Whole numbers have it at their own times alone. Other draws have it in between as well, within the range of the
+    draws, so that the band of a positive quantity stays positive.
     """
-    filled = len(curves[0]) >= _BARS
-    if filled and start and start[0] < curves[0][0]:
-        curves = [np.append(first, curve) for first, curve in zip(start, curves, strict=True)]
-    time, mean, *bounds = curves
-    for order, (low, high, tint) in enumerate(zip(bounds[::2], bounds[1::2], tints, strict=True), start=1):
-        if filled:
-            axes.fill_between(time, low, high, color=tint, lw=0, zorder=order)
-        else:
-            axes.vlines(time, low, high, color=tint, lw=7 - 2 * order, zorder=order)
-    marks: dict[str, Any] = {} if filled else {"ls": "", "marker": "_", "ms": 5}
-    axes.plot(time, mean, color=line, zorder=3, **marks)
+    measured, which = np.unique(predictive["time"].values, return_inverse=True)
+    draws = predictive.values.reshape(-1, predictive.sizes["time"])
+    bounds = np.array([quantiles(draws[:, which == k].ravel(), INTERVAL) for k in range(len(measured))])
+    if np.all(draws == np.round(draws)):
+        return (measured, bounds[:, 0], bounds[:, 1]), "mid"
+    grid = np.union1d(measured, positions[(positions >= measured[0]) & (positions <= measured[-1])])
+    bound_curves = [np.interp(grid, positions, curve)
+                    + np.interp(grid, measured, bound - np.interp(measured, positions, curve))
+                    for curve, bound in zip((low, high), bounds.T, strict=True)]
+    lower, upper = np.clip(bound_curves, np.nanmin(draws), np.nanmax(draws))
+    return (grid, lower, upper), None
 
 
 def _band(result: Any, kind: str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -393,48 +320,14 @@ def _summary(result: Any, name: str) -> xr.DataArray | None:
     return None if summary is None or "series" in summary.dims else summary.transpose("statistic", "at", ...)
 
 
-def _widened(
-    predictive: xr.DataArray, positions: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times from the first to the last measurement and the predictive interval there."""
-    measured, which = np.unique(predictive["time"].values, return_inverse=True)
-    draws = predictive.values.reshape(-1, predictive.sizes["time"])
-    bounds = np.array([quantiles(draws[:, which == k].ravel(), INTERVAL) for k in range(len(measured))])
-    below = bounds[:, 0] - np.interp(measured, positions, low)
-    above = bounds[:, 1] - np.interp(measured, positions, high)
-    grid = np.union1d(measured, positions[(positions >= measured[0]) & (positions <= measured[-1])])
-    return (
-        grid,
-        np.interp(grid, positions, low) + np.interp(grid, measured, below),
-        np.interp(grid, positions, high) + np.interp(grid, measured, above),
-    )
-
-
 def _draw_data(axes: Axes, data: xr.DataArray) -> None:
-    times, values = data["time"].values, data.values
-    missing = np.isnan(values)
-    axes.plot(
-        times[~missing],
-        values[~missing],
-        rasterized=len(times) > 5000,
-        **_data_style(len(times)),
-    )
-    axes.plot(
-        times[missing],
-        np.full(missing.sum(), 0.04),
-        transform=axes.get_xaxis_transform(),
-        **_missing_style(len(times)),
-    )
-
-
-def _data_style(count: int) -> dict[str, Any]:
-    """Return how to draw ``count`` values: many of them small, and under the line of the mean."""
-    common = {"ls": "", "marker": "o"}
-    if count > _MANY:
-        return {**common, "color": style.GREY, "ms": 1.5, "mew": 0, "zorder": 2.5}
-    return {**common, "color": style.BLACK, "ms": 2.6, "mec": "white", "mew": 0.3, "zorder": 4}
-
-
-def _missing_style(count: int) -> dict[str, Any]:
-    size = 2 if count > _MANY else 3
-    return {"color": style.GREY, "ls": "", "marker": "x", "ms": size, "mew": 0.8, "zorder": 5}
+    """Draw measurements, many of them small, and ticks at the top edge where one is missing."""
+    times, values, is_missing = data["time"].values, data.values, np.isnan(data.values)
+    look: dict[str, Any] = {"color": style.BLACK, "ms": 2.6, "mec": "white", "mew": 0.3, "zorder": 4}
+    if len(times) > _MANY:
+        look = {"color": style.GREY, "ms": 1.5, "mew": 0, "zorder": 2.5}
+    axes.plot(times[~is_missing], values[~is_missing], ls="", marker="o", rasterized=len(times) > 5000, label="data",
+              **look)
+    if is_missing.any():
+        axes.plot(times[is_missing], np.full(is_missing.sum(), 0.98), transform=axes.get_xaxis_transform(), ls="",
+                  color=style.GREY, marker="|", ms=4, mew=0.8, zorder=5, label="missing")

@@ -1,0 +1,147 @@
+"""Forecasts in the figures over time: the rows that are shown before them, and their curves.
+
+1. Next to a forecast that was made after the fit and is short beside the data, `recent_part` keeps the last rows only.
+2. Mean and bands continue those of the fit. Predictions at few times are bars: the curve between them is unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.arviz_data import group, has_group
+from lfm_ppl.results.inputs import FORECAST
+from lfm_ppl.results.plots import style
+from lfm_ppl.results.predictions import GROUP, HELD_OUT, INTERVAL, MEAN, interval, noise_free_interval
+
+NOISE_FREE, PREDICTIVE = "#8FBFDE", "#D3E4F1"
+"""Tints of blue: bands of noise-free outputs and of new data."""
+
+_CURVES = 40  # predictions from which they are drawn as curves
+_SMALLEST_SHARE, _FEWEST_ROWS = 0.2, 20
+"""Share of the axis below which a forecast gets a third of it, and rows that are shown before it at least."""
+
+
+def series_predictions(result: Any) -> xr.Dataset | None:
+    """Return the predictions of one series; None where there are none."""
+    if not has_group(result, GROUP):
+        return None
+    dataset = group(result, GROUP)
+    return None if "series" in dataset.dims else dataset.drop_duplicates("time")
+
+
+def forecast_span(result: Any) -> tuple[float, float]:
+    """Return the times of the last observation and of the last prediction; minus infinity without predictions."""
+    predicted = series_predictions(result)
+    if predicted is None or predicted.sizes["time"] == 0:
+        return -np.inf, -np.inf
+    end = float(predicted["time"].values.max())
+    return float(predicted.attrs.get("last_observation", end)), end
+
+
+def is_made_later(result: Any) -> bool:
+    """Return whether the predictions reach beyond the data and the trajectories of the fit."""
+    last, end = forecast_span(result)
+    return last < end and not (has_group(result, "trajectories") and
+                               group(result, "trajectories")["at"].values.max() >= end)
+
+
+def without_forecast(result: Any) -> Any:
+    """Return the result as the fit left it, without a forecast that was made later."""
+    if not is_made_later(result):
+        return result
+    return arviz_data.build({name: group(result, name) for name in arviz_data.groups(result)
+                             if name not in (GROUP, HELD_OUT, FORECAST)}, arviz_data.attributes(result))
+
+
+def forecast_window(result: Any) -> tuple[float, float] | None:
+    """Return the interval of time to show of a result with a forecast; None: everything."""
+    if not is_made_later(result) or not has_group(result, "observed_data"):
+        return None
+    last, end = forecast_span(result)
+    times = group(result, "observed_data")["time"].values
+    start = min(last - 2.0 * (end - last), times[-_FEWEST_ROWS:][0])
+    return None if end - last >= _SMALLEST_SHARE * (end - times[0]) or start <= times[0] else (start, end)
+
+
+def recent_part(result: Any) -> tuple[Any, str]:
+    """Return the result within `forecast_window`, and a remark where rows are left out."""
+    window = forecast_window(result)
+    if window is None:
+        return result, ""
+    times = group(result, "observed_data")["time"].values
+    groups = {}
+    for name in arviz_data.groups(result):
+        groups[name] = group(result, name)
+        for clock in {"time", "at", "at_truth"} & set(groups[name].dims):
+            groups[name] = groups[name].isel({clock: groups[name][clock].values >= window[0]})
+    remark = f"The last {(times >= window[0]).sum()} of {len(times)} rows of data and the forecast."
+    return arviz_data.build(groups, arviz_data.attributes(result)), remark
+
+
+def mark_last_observation(axes: Axes, result: Any) -> None:
+    """Mark the last observation where predictions follow it."""
+    last, end = forecast_span(result)
+    if last < end:
+        axes.axvline(last, color=style.GREY, lw=0.8, ls=(0, (1, 2)), zorder=2.5, label="last observation")
+
+
+def draw_held_out(axes: Axes, result: Any, name: str) -> None:
+    """Draw the data that the predictions of an output were compared with."""
+    if has_group(result, HELD_OUT):
+        values = group(result, HELD_OUT)["y"].sel(output=name)
+        axes.plot(values["time"], values, color=style.BLACK, ls="", marker="o", ms=2.6, mfc="white", mew=0.6, zorder=4,
+                  label="held-out data")
+
+
+def draw_outputs(axes: Axes, predicted: xr.Dataset, start: tuple[float, ...] = ()) -> None:
+    """Draw predictions of one output, noise-free and new data.
+
+    Args:
+        axes: the panel.
+        predicted: predictions of one output.
+        start: time, mean and ends of both bands from which the predictions continue; empty where nothing comes before.
+    """
+    if predicted.sizes["time"] == 0:
+        return
+    time, lower, upper = new_data_band(predicted)
+    low, high = noise_free_interval(predicted)[..., 0]
+    mean = predicted[MEAN if MEAN in predicted else "outputs"].mean(["chain", "draw"]).values[:, 0]
+    _draw_curves(axes, (time, mean, lower, upper, low, high), start, style.BLUE,
+                 {"95%, new data": PREDICTIVE, "95%, noise-free": NOISE_FREE})
+
+
+def new_data_band(predicted: xr.Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times and the ends of the 95% interval of new data of one output."""
+    return predicted["time"].values, *interval(predicted)[..., 0]
+
+
+def draw_paths(axes: Axes, paths: xr.DataArray, start: tuple[float, ...], line: str, tint: str) -> None:
+    """Draw predictions of a force, a state or a deterministic (chain, draw, time) with their 95% band."""
+    if paths.sizes["time"]:
+        flat = paths.transpose("chain", "draw", "time").values.reshape(-1, paths.sizes["time"])
+        curves = (paths["time"].values, flat.mean(axis=0), *np.quantile(flat, INTERVAL, axis=0))
+        _draw_curves(axes, curves, start, line, {"95%": tint})
+
+
+def _draw_curves(axes: Axes, curves: Sequence[np.ndarray], start: tuple[float, ...], line: str,
+                 tints: dict[str, str]) -> None:
+    """Draw times, a mean and the ends of bands, the widest first; ``tints`` maps the labels of bands to colours."""
+    count = len(curves[0])
+    if count >= _CURVES and start and start[0] < curves[0][0]:
+        curves = [np.append(first, curve) for first, curve in zip(start, curves, strict=True)]
+    time, mean, *bounds = curves
+    thickness = min(5.0, 70.0 / count)  # points
+    for order, (label, tint) in enumerate(tints.items(), start=1):
+        low, high = bounds[2 * order - 2:2 * order]
+        if count >= _CURVES:
+            axes.fill_between(time, low, high, color=tint, lw=0, zorder=order, label=label)
+        else:
+            axes.vlines(time, low, high, color=tint, lw=thickness * (1.4 - 0.4 * order), zorder=order, label=label)
+    marks: dict[str, Any] = {} if count >= _CURVES else {"ls": "", "marker": "_", "ms": thickness}
+    axes.plot(time, mean, color=line, zorder=3, label="posterior mean", **marks)
