@@ -106,8 +106,9 @@ def test_tick_labels_are_short_and_distinct(limits, power, labels):
 
 
 def test_names_are_whole():
-    axes = style.new_figure("column", 2.0).add_subplot()
-    style.label_values(axes, "outdoor_temperature_of_roof", "degC")
+    with style.in_style():
+        axes = style.new_figure("column", 2.0).add_subplot()
+        style.label_values(axes, "outdoor_temperature_of_roof", "degC")
     assert (axes.get_title(loc="left"), axes.get_ylabel()) == ("outdoor_temperature_of_roof", "degC")
     style.label_values(axes, "basal_rate[CDKN1A]", "nM")
     assert axes.get_ylabel() == "basal_rate[CDKN1A]\n(nM)"
@@ -140,7 +141,7 @@ def test_fit_draws_data_means_and_quantiles(result, datasets):
 
 def test_band_of_new_data_keeps_to_the_values_that_the_family_has(datasets):
     predictive = datasets["posterior_predictive"]
-    counts = np.random.default_rng(0).poisson(0.5 + 4 * (predictive["time"] > 6), predictive["y"].shape)
+    counts = np.random.default_rng(0).poisson(0.5 + 4 * (predictive["time"].values[:, None] > 6), predictive["y"].shape)
     for values, kind in ((counts, "whole"), (counts + 0.001 * predictive["y"] ** 2, "positive")):
         new = predictive.assign(y=(predictive["y"].dims, np.asarray(values, float)))
         axes = plot_fit(arviz_data.build({**datasets, "posterior_predictive": new})).axes[0]
@@ -226,7 +227,7 @@ def test_forecasts_continue_mean_and_bands_as_curves_or_bars(datasets):
 
 
 def test_a_short_forecast_shows_the_last_rows_and_held_out_data(datasets):
-    last, end = 12.0, 15.0
+    last, end = 12.0, 14.0
     paths = datasets["trajectories"]
     datasets["trajectories"] = paths.sel(at=paths["at"] <= last)
     ahead = predictions(datasets, np.linspace(12.5, end, 5), last)
@@ -235,7 +236,7 @@ def test_a_short_forecast_shows_the_last_rows_and_held_out_data(datasets):
     result = arviz_data.build({**datasets, "predictions": ahead, "held_out_data": held_out})
     axes = plot_fit(result).axes[1]
     shown = the_line(axes, "data").get_xdata()
-    assert 0 < shown.min() <= last - 2 * (end - last) + 1.0 and shown.max() == last
+    assert 0 < shown.min() <= last - 2 * (end - last) and shown.max() == last
     marks = the_line(axes, "held-out data")
     np.testing.assert_array_equal(marks.get_xydata(), [[13.0, 2.0], [13.5, np.nan]])
     assert marks.get_linestyle() == "None"
@@ -336,7 +337,7 @@ def test_residuals_of_every_second_row_few_or_no_observations(datasets, readable
     readable(figure)
     assert [axes.get_title(loc="left") for axes in figure.axes].count("KS: few data") == 2
     (envelope,) = [patch for patch in figure.axes[5].patches if hasattr(patch, "get_data")]
-    assert np.nanmax(envelope.get_data().values) < 1.0  # no stripes over the whole height
+    assert np.nanmax(envelope.get_data().values) < 1.5  # no stripes over the whole height
     assert figure.axes[3].get_ylim()[0] < -9.0
     assert not recwarn.list
 

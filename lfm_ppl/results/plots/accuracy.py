@@ -152,7 +152,7 @@ def _mark_means(axes: Axes, posterior_mean: float, corrected_mean: float) -> Non
     """Mark the means under the densities."""
     where = axes.get_xaxis_transform()
     for mean, colour in ((posterior_mean, style.BLUE), (corrected_mean, style.VERMILLION)):
-        axes.plot(mean, 0.04, color=colour, marker="^", ms=4, mew=0, ls="", transform=where, zorder=4, label="its mean")
+        axes.plot(mean, 0.04, color=colour, marker="^", ms=4, mew=0, ls="", transform=where, zorder=4, label="mean")
 
 
 def _explanation(report: AccuracyReport) -> str:

@@ -136,7 +136,7 @@ def _draw_curves(axes: Axes, curves: Sequence[np.ndarray], start: tuple[float, .
     if count >= _CURVES and start and start[0] < curves[0][0]:
         curves = [np.append(first, curve) for first, curve in zip(start, curves, strict=True)]
     time, mean, *bounds = curves
-    thickness = min(5.0, 70.0 / count)  # points
+    thickness = min(5.0, 10.0 * axes.figure.get_figwidth() / count)  # points; bars of a short forecast stay apart
     for order, (label, tint) in enumerate(tints.items(), start=1):
         low, high = bounds[2 * order - 2:2 * order]
         if count >= _CURVES:
