@@ -45,7 +45,8 @@ ONLY_DRAWS = "all draws, without scores and trajectories"
 """Attribute ``partial`` of a result without any post-processing."""
 
 _GRID_POINTS = 200
-"""Number of grid points of trajectories where no times are requested."""
+"""Number of grid points of trajectories where no times are requested; with a season, 16 a period and five times as many
+at most."""
 
 _SEASON_POINTS = 97
 """Number of points in the last periods of a force that repeats often."""
@@ -214,9 +215,12 @@ def _trajectory_times(bound: BoundModel, requested_times: Any) -> np.ndarray | N
     if requested_times is not None:
         return np.atleast_1d(np.asarray(requested_times, float))
     origin = float(bound.site.example.time_grid.initial_time)
-    grid = subdivide(np.union1d(min(origin, times[0]), times), _GRID_POINTS)
-    for period in force_periods(bound.site.example.ssm.model).values():
-        if repeats_often(period, times[-1] - grid[0]):
+    nodes = np.union1d(min(origin, times[0]), times)
+    span, periods = nodes[-1] - nodes[0], force_periods(bound.site.example.ssm.model).values()
+    points = max([_GRID_POINTS, *(int(16 * span / period) for period in periods)])
+    grid = subdivide(nodes, min(points, 5 * _GRID_POINTS))
+    for period in periods:
+        if repeats_often(period, span):
             grid = np.union1d(grid, np.linspace(times[-1] - SHOWN_PERIODS * period, times[-1], _SEASON_POINTS))
     return grid
 

@@ -205,6 +205,9 @@ def test_a_force_that_repeats_often_shows_its_last_periods(datasets):
     end = paths["at"].values[-1]
     assert the_line(p53, "posterior mean").get_xdata()[0] == paths["at"].values[0]
     assert end - 3.0 <= the_line(stress, "posterior mean").get_xdata()[0] < end - 2.5
+    ahead = predictions(datasets, np.linspace(13.0, 30.0, 80), 12.0)
+    stress = plot_forces(arviz_data.build({**datasets, "predictions": ahead})).axes[1]
+    assert max(line.get_xdata()[-1] for line in lines(stress, "posterior mean")) <= end + 3.0
 
 
 def test_forecasts_continue_mean_and_bands_as_curves_or_bars(datasets):

@@ -23,6 +23,7 @@ NOISE_FREE, PREDICTIVE = "#8FBFDE", "#D3E4F1"
 """Tints of blue: bands of noise-free outputs and of new data."""
 
 _CURVES = 40  # predictions from which they are drawn as curves
+_LONGEST_GAP = 3.0  # usual gaps between predictions that a curve crosses; nights without rows are longer
 _SMALLEST_SHARE, _FEWEST_ROWS = 0.2, 20
 """Share of the axis below which a forecast gets a third of it, and rows that are shown before it at least."""
 
@@ -136,12 +137,15 @@ def _draw_curves(axes: Axes, curves: Sequence[np.ndarray], start: tuple[float, .
     if count >= _CURVES and start and start[0] < curves[0][0]:
         curves = [np.append(first, curve) for first, curve in zip(start, curves, strict=True)]
     time, mean, *bounds = curves
+    gaps = np.diff(time)
+    is_far = gaps > _LONGEST_GAP * np.median(gaps) if count >= _CURVES else np.ones(len(gaps), bool)
+    is_bar = np.append(True, is_far) & np.append(is_far, True)
+    broken = [np.insert(curve, np.flatnonzero(is_far) + 1, np.nan) for curve in (time, mean, *bounds)]
     thickness = min(5.0, 10.0 * axes.figure.get_figwidth() / count)  # points; bars of a short forecast stay apart
     for order, (label, tint) in enumerate(tints.items(), start=1):
         low, high = bounds[2 * order - 2:2 * order]
-        if count >= _CURVES:
-            axes.fill_between(time, low, high, color=tint, lw=0, zorder=order, label=label)
-        else:
-            axes.vlines(time, low, high, color=tint, lw=thickness * (1.4 - 0.4 * order), zorder=order, label=label)
-    marks: dict[str, Any] = {} if count >= _CURVES else {"ls": "", "marker": "_", "ms": thickness}
-    axes.plot(time, mean, color=line, zorder=3, label="posterior mean", **marks)
+        axes.fill_between(broken[0], *broken[2 * order:2 * order + 2], color=tint, lw=0, zorder=order, label=label)
+        breadth = thickness * (1.4 - 0.4 * order)
+        axes.vlines(time[is_bar], low[is_bar], high[is_bar], color=tint, lw=breadth, zorder=order)
+    axes.plot(broken[0], broken[1], color=line, zorder=3, label="posterior mean")
+    axes.plot(time[is_bar], mean[is_bar], color=line, ls="", marker="_", ms=thickness, zorder=3)

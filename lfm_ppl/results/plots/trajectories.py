@@ -190,32 +190,32 @@ def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, width: s
     names, note = style.first_of(pick(draws, kind, selection), selection, MAX_PANELS, f"{kind}s")
     predicted = forecasts.series_predictions(result)
     paths = None if predicted is None else predicted.get(f"{kind}s")
-    starts = _first_shown(draws, forecasts.forecast_span(result)[1])
-    figure, panels = style.small_multiples(width, len(names), 1.25, sharex=not set(starts) & set(names))
+    windows = _season_windows(draws, forecasts.forecast_span(result)[1])
+    figure, panels = style.small_multiples(width, len(names), 1.25, sharex=not set(windows) & set(names))
     for axes, name in zip(panels, names, strict=True):
         band = np.array(_band(result, kind, name))
-        time, mean, low, high = band[:, band[0] >= starts.get(name, -np.inf)]
+        first, last = windows.get(name, (-np.inf, np.inf))
+        time, mean, low, high = band[:, band[0] >= first]
         axes.plot(time, mean, color=colours[0], zorder=2, label="posterior mean")
         axes.fill_between(time, low, high, color=colours[1], lw=0, zorder=1, label="95%")
         if paths is not None:
-            later = paths.sel({kind: name, "time": paths["time"] > time[-1]})
+            later = paths.sel({kind: name, "time": (paths["time"] > time[-1]) & (paths["time"] <= last)})
             forecasts.draw_paths(axes, later, (time[-1], mean[-1], low[-1], high[-1]), *colours)
             forecasts.mark_last_observation(axes, result)
         _draw_truth(axes, result, kind, name)
         style.label_values(axes, name, unit_of(draws, name))
-    shortened = [name for name in names if name in starts]
-    periods = f"Of {', '.join(shortened)} the last {SHOWN_PERIODS} periods." if shortened else ""
+    shortened = [name for name in names if name in windows]
+    periods = f"Of {', '.join(shortened)} {SHOWN_PERIODS} periods at the end of the data." if shortened else ""
     _finish(figure, panels, result, f"{remark} {periods} {note}")
     return figure
 
 
-def _first_shown(draws: xr.DataArray, end: float) -> dict[str, float]:
-    """Return the time from which each force that repeats often is shown."""
+def _season_windows(draws: xr.DataArray, end: float) -> dict[str, tuple[float, float]]:
+    """Return the interval of time to show of each force that repeats often, about the end of its trajectories."""
     times = draws["at"].values
-    end = max(end, times[-1])
     periods = json.loads(draws.attrs.get(PERIODS, "{}"))
-    return {name: end - SHOWN_PERIODS * period for name, period in periods.items()
-            if repeats_often(period, end - times[0])}
+    return {name: (times[-1] - SHOWN_PERIODS * period, times[-1] + SHOWN_PERIODS * period)
+            for name, period in periods.items() if repeats_often(period, max(end, times[-1]) - times[0])}
 
 
 def _finish(figure: Figure, panels: list[Axes], result: Any, remark: str) -> None:
