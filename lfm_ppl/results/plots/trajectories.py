@@ -40,7 +40,8 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, width: str | 
     trajectories hold; where they hold draws alone, they are quantiles of these, and the outer one ends with the data:
     it is exact at the measurement times, and between them the inner one widened by the difference of the two,
     interpolated linearly; of counts it is a step at each time. Replicates are pooled. Of simulated data the noise-free
-    truth is drawn, too.
+    truth is drawn, too. A band shows the model as it is: under Gaussian noise new data of a positive quantity may be
+    negative; observe its logarithm, or use an observation family of positive values.
 
     Args:
         result: with the groups observed_data and trajectories, posterior_predictive for the outer band, predictions for
