@@ -1,6 +1,5 @@
 """Known inputs from a table to the model, the result, and back; and tables of other libraries."""
 
-import argparse
 import pathlib
 
 import jax.numpy as jnp
@@ -12,9 +11,10 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
-from lfm_ppl.cli import description
-from lfm_ppl.cli import fit as command
+from lfm_ppl.cli import main
 from lfm_ppl.cli.data_file import read_data
+from lfm_ppl.cli.fit import observed_data
+from lfm_ppl.cli.options import Columns, DataOptions
 from lfm_ppl.io import loading
 from lfm_ppl.io.data import write_csv
 from lfm_ppl.io.data_set import Data, InputTable
@@ -46,9 +46,9 @@ def folder(tmp_path):
 
 
 def arguments(folder, **changed):
-    settings = {"data": str(folder / "house.csv"), "outputs": "indoor", "inputs": "heater,outside:linear",
-                "time_column": None, "time_unit": None, "truth": None}
-    return argparse.Namespace(**{**settings, **changed})
+    settings = {"data": str(folder / "house.csv"), "outputs": "indoor", "inputs": "heater,outside:linear"} | changed
+    columns = Columns(outputs=settings.pop("outputs"), inputs=settings.pop("inputs"))
+    return DataOptions(columns=columns, **settings)
 
 
 def test_inputs_hold_or_are_joined_and_skip_empty_cells(folder):
@@ -99,7 +99,7 @@ def test_the_command_line_reads_blank_cells_as_zero(folder, recwarn):
 
 def test_the_command_line_maps_columns_to_the_model_s_names(folder):
     model = loading.load(str(folder / "house.py"))
-    data = command._observed(arguments(folder), model, {})
+    data = observed_data(arguments(folder), model, {})
     assert data.outputs == ("T",)
     assert {name: table.interpolation for name, table in data.inputs.items()} == {
         "power": "previous", "weather": "linear"}
@@ -110,19 +110,18 @@ def test_dates_are_counted_in_the_model_s_unit_of_time_unless_the_user_says_anot
     (folder / "house.csv").write_text(HALF_HOURS)
     (folder / "house.py").write_text('UNITS = {"time": "h"}\n' + MODEL)
     model = loading.load(str(folder / "house.py"))
-    data = command._observed(arguments(folder), model, {})
+    data = observed_data(arguments(folder), model, {})
     np.testing.assert_allclose(data.times, [6.0, 6.5, 7.0], rtol=1e-15)
     np.testing.assert_array_equal(data.inputs["power"].times, data.times)
     assert data.units["time"] == "h"
-    said = command._observed(arguments(folder, time_unit="min"), model, {})
+    said = observed_data(arguments(folder, time_unit="min"), model, {})
     assert said.times.tolist() == [360.0, 390.0, 420.0] and said.units["time"] == "min"
 
 
-def test_a_model_of_known_inputs_is_described_without_data():
-    room = loading.load(str(pathlib.Path(__file__).parent.parent / "docs" / "examples" / "room.py"))
-    result = description.describe(room)
-    assert [parameter.name for parameter in result.parameters] == list(room.parameters)
-    assert result.forces == {"heat": "Matern (K/h)"} and result.approximation == "exact: the model is linear"
+def test_a_model_of_known_inputs_is_described_without_data(capsys):
+    assert main(["models", str(pathlib.Path(__file__).parent.parent / "docs" / "examples" / "room.py")]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "heat Matern (K/h)" in printed and "likelihood: exact: the model is linear" in printed
 
 
 @pytest.mark.parametrize(("changed", "message"), [
@@ -137,7 +136,7 @@ def test_a_model_of_known_inputs_is_described_without_data():
 ])
 def test_wrong_inputs_are_named(folder, changed, message):
     with pytest.raises(ValueError, match=message):
-        command._observed(arguments(folder, **changed), loading.load(str(folder / "house.py")), {})
+        observed_data(arguments(folder, **changed), loading.load(str(folder / "house.py")), {})
 
 
 @pytest.mark.parametrize(("text", "message"), [

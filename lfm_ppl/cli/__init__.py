@@ -1,4 +1,4 @@
-"""The command line, ``lfm-ppl``: a module for the arguments and one for each command."""
+"""The command line, ``lfm-ppl``: `commands` and their `options`, and a module for the work of each command."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from lfm_ppl.cli.arguments import parsed
-from lfm_ppl.io import loading
-from lfm_ppl.utils import checks
+from lfm_ppl.cli import commands
 from lfm_ppl.utils.errors import RunError
-from lfm_ppl.utils.interruption import INTERRUPTED, watched
+from lfm_ppl.utils.interruption import INTERRUPTED, interruptible
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -27,27 +25,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         on standard error without ``--debug``; 130 after Ctrl-C.
     """
     line = list(sys.argv[1:] if argv is None else argv)
-    try:
-        arguments = parsed(argv)
-    except ValueError as error:  # a study's options come from its settings, which import JAX
-        if "--debug" in line:
-            raise
-        print(f"lfm-ppl: error: {_one_line(error)}", file=sys.stderr)
-        return 2
-    arguments.line = line
     warnings.showwarning = _Warnings()
     try:
-        # Some libraries swallow KeyboardInterrupt while they are imported, and workers may be slow to end.
-        with watched(lambda: "what was written before is kept"):
-            return int(arguments.run(arguments))
+        with interruptible():
+            command, arguments = commands.parse(line)
+            return command(*arguments.args, **arguments.kwargs) or 0
     except KeyboardInterrupt as error:
-        print(f"lfm-ppl: {str(error) or 'interrupted'}", file=sys.stderr)
+        print(f"\nlfm-ppl: {str(error) or 'interrupted; what was written before is kept'}", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:  # the reader of the pipe, such as `head`, has closed it
         sys.stderr.close()
         return 0
     except Exception as error:
-        if arguments.debug:
+        if "--debug" in line:
             raise
         print(f"lfm-ppl: error: {_one_line(error)}", file=sys.stderr)
         return 2
@@ -55,15 +45,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _one_line(error: Exception) -> str:
     """Return the error in one line, with the line of the model file that caused it."""
-    text = (" ".join(str(error).split()) or type(error).__name__) + _remedy(error)
-    location = loading.place_in_model(error)
-    if (
-        isinstance(error, KeyError)
-        and location is not None
-        and (input_names := loading.known_inputs(error)) is not None
-    ):
+    from cyclopts import CycloptsError
+
+    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, CycloptsError):
+        return text
+    from lfm_ppl.io import loading
+
+    text, location = text + _remedy(error), loading.place_in_model(error)
+    if isinstance(error, KeyError) and location is not None and (names := loading.known_inputs(error)) is not None:
         return (f"{location.file}, line {location.line}: the model reads the known input {text}, and "
-                + (f"has {', '.join(input_names)}. Correct the name, or add it to INPUTS." if input_names else
+                + (f"has {', '.join(names)}. Correct the name, or add it to INPUTS." if names else
                    "has none. Name it in INPUTS, with the way it is read between rows."))
     if location is not None and location.file not in text and not (isinstance(error, ValueError) and location.shipped):
         kind = "" if isinstance(error, (ValueError, TypeError)) else f"{type(error).__name__}: "
@@ -83,18 +75,17 @@ _INVALID = re.compile(r"distribution got invalid (\w+) parameter")
 
 def _remedy(error: Exception) -> str:
     """Return the remedy of some errors of Python and NumPyro; empty for others."""
-    if isinstance(error, TypeError) and (called := _UNEXPECTED.search(str(error))) is not None:
-        import lfm_ppl
+    import lfm_ppl
+    from lfm_ppl.io import loading
+    from lfm_ppl.utils import checks
 
-        public_object = getattr(lfm_ppl, called[1], None)
-        if public_object is None:
-            return ""
-        names = list(inspect.signature(public_object).parameters)
-        return f".{checks.nearest(called[2], names)} It takes {', '.join(names)}."
-    if isinstance(error, ValueError) and (wrong := _INVALID.search(str(error))) is not None:
-        location = loading.place_in_model(error)
-        line = "" if location is None else linecache.getline(str(location.file), location.line).strip()
-        return f" A {wrong[1]} outside of its range stands in: {line}" if line else ""
+    unexpected, invalid = _UNEXPECTED.search(str(error)), _INVALID.search(str(error))
+    if unexpected and hasattr(lfm_ppl, unexpected[1]):
+        names = list(inspect.signature(getattr(lfm_ppl, unexpected[1])).parameters)
+        return f".{checks.nearest(unexpected[2], names)} It takes {', '.join(names)}."
+    if invalid and (location := loading.place_in_model(error)) is not None:
+        source = linecache.getline(str(location.file), location.line).strip()
+        return f" A {invalid[1]} outside of its range stands in: {source}"
     return ""
 
 

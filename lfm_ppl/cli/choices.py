@@ -1,4 +1,4 @@
-"""Values of options: rules, fixed parameters, bounds, known inputs, workers."""
+"""Values of options: rules, fixed parameters, bounds, known inputs."""
 
 from __future__ import annotations
 
@@ -7,22 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from lfm_ppl.cli.options import RULES
 from lfm_ppl.io.loading import ModelFile
 from lfm_ppl.utils import checks
 
-# Value of --rule -> class in lfm_ppl, which is used with its defaults.
-RULES = {
-    "cubature": "Cubature",
-    "taylor": "Taylor",
-    "unscented": "Unscented",
-    "gauss-hermite": "GaussHermite",
-    "central-difference": "CentralDifference",
-    "monte-carlo": "MonteCarlo",
-}
-REFERENCES = ("auto", "grid", "particles")
 FREE = "free"
-MOST_JOBS = 4
-"""Default largest number of processes; each takes one or two GiB."""
 
 
 def options(model: ModelFile, texts: Sequence[str]) -> dict[str, Any]:
@@ -119,19 +108,3 @@ def _number(name: str, text: str) -> Any:
     checks.finite(f"--set {name}", np.array(values))
     return values[0] if len(values) == 1 else values
 
-
-def workers(jobs: int | None, scheduler: str | None) -> int | str:
-    """Return the workers of ``--jobs`` and ``--scheduler``, an argument of `lfm_ppl.parallel.run.run_tasks`.
-
-    Raises:
-        ValueError: both are given.
-    """
-    from lfm_ppl.parallel.cluster import available, check_workers
-
-    if scheduler is None:
-        return jobs or min(available(), MOST_JOBS)
-    if jobs is not None:
-        raise ValueError("--jobs is the number of processes on this machine; a scheduler has workers of its own. Give "
-                         "one of --jobs and --scheduler.")
-    check_workers(scheduler)
-    return scheduler

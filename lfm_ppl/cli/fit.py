@@ -8,230 +8,173 @@
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import dataclasses
-import shlex
 import shutil
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import lfm_ppl
 from lfm_ppl.cli import choices, fit_many, page, results, session
 from lfm_ppl.cli.data_file import read_data
-from lfm_ppl.cli.fit_arguments import approximated_model, check_sampler, result_attributes, sampling_arguments
+from lfm_ppl.cli.fit_arguments import approximated_model, result_attributes, sampling_arguments
+from lfm_ppl.cli.options import DataOptions, FitOptions
 from lfm_ppl.cli.requested_times import trajectory_times
+from lfm_ppl.inference.bind import bind
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
 from lfm_ppl.io.truth import read_truth
+from lfm_ppl.results import arviz_data, checkpoint, files, tables
 from lfm_ppl.utils import calendar_time
-from lfm_ppl.utils.interruption import INTERRUPTED, watched
+from lfm_ppl.utils.interruption import INTERRUPTED, interruptible
 from lfm_ppl.utils.progress import duration
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(name: str, options: FitOptions, line: Sequence[str]) -> int:
     """Fit, print the summary, and write the results; the posterior is on disk before any figure."""
-    from lfm_ppl.results import arviz_data, checkpoint
-
-    if arguments.each or arguments.series is not None:
-        return fit_many.run(arguments)
-    if arguments.jobs is not None or arguments.scheduler is not None:
+    if options.data.each or options.data.series is not None:
+        return fit_many.run(name, options, line)
+    if options.processes.jobs is not None or options.processes.scheduler is not None:
         raise ValueError("--jobs and --scheduler are for many data sets; give them with --each or --series.")
-    session.start(arguments.chains, not arguments.no_cache)
-    model = loading.load(arguments.model)
-    options = choices.options(model, arguments.option)
-    observed = _observed(arguments, model, options)
-    fixed = choices.fixed(arguments.set, model.anchors(observed), model.options)
-    requested_times = trajectory_times(observed, arguments.until, arguments.at)
-    check_sampler(arguments)
-    numpyro_model = approximated_model(arguments, model)
-    if arguments.resume and arguments.out is None:
+    output = options.output
+    session.start(options.inference.chains, not output.no_cache)
+    model = loading.load(name)
+    model_options = choices.options(model, options.inference.option)
+    observed = observed_data(options.data, model, model_options)
+    keywords = model.keywords(observed, model_options)
+    fixed = choices.fixed(options.inference.set, model.anchors(observed), model.options)
+    times = trajectory_times(observed, output.times)
+    numpyro_model = approximated_model(options, model)
+    if output.out is not None:
+        checkpoint.check_folder(output.out, output.resume, output.overwrite)
+    elif output.resume:
         raise ValueError("--resume continues the run in a folder; name the folder with --out.")
-    if arguments.resume and arguments.overwrite:
-        raise ValueError("--resume continues a run, --overwrite starts a new one; give one of them.")
-    if arguments.out is not None:  # first: its error mentions resumable runs
-        checkpoint.check_folder(arguments.out, arguments.resume, arguments.overwrite)
-    with results.folder(model.name, arguments.out, arguments.overwrite, arguments.resume) as folder:
-        finished = arguments.resume and checkpoint.is_finished(folder)
-        if arguments.resume and not finished and not checkpoint.has_run(folder):
+    with results.folder(model.name, output.out, output.overwrite or output.resume) as folder:
+        is_finished = output.resume and checkpoint.is_finished(folder)
+        if output.resume and not is_finished and not checkpoint.has_run(folder):
             print(f"resume   no run to resume in {folder}: this is a new run")
-        if arguments.set:  # an unknown name must not be printed as fixed
-            _check_fixed(numpyro_model, observed, model.keywords(observed, options), fixed)
-        _print_task(arguments, model, observed, options, fixed)
-        started = time.perf_counter()
-        resume_hint = f"resume with: {_resume_command(arguments, folder)}"
-        with watched(lambda: resume_hint if checkpoint.has_run(folder) else _nothing_left(folder)) as watch:
-            try:
-                posterior = sample(arguments, model, numpyro_model, observed, options, fixed, folder, requested_times)
-            except KeyboardInterrupt as error:
-                reason = str(error) or "stopped before there were draws"
-                print(
-                    f"\nlfm-ppl: {reason}" + (f"; {resume_hint}" if checkpoint.has_run(folder) else ""), file=sys.stderr
-                )
-                return INTERRUPTED
+        if options.inference.set:  # an unknown name must not be printed as fixed
+            with calendar_time.in_messages(observed.origin, observed.units.get("time", "")):
+                bind(numpyro_model, observed.times, observed.y, **keywords).fix(fixed)
+        _print_data(options, model, observed, fixed)
+        _print_settings(options, model_options, observed)
+        resume = page.command_line(line, *([] if output.out else ["--out", str(folder)]), "--resume")
+        start_time = time.perf_counter()
+        with interruptible(lambda: _remains(folder, resume)):
+            posterior = sample(
+                numpyro_model, observed, at=times, model_kwargs=keywords, fixed=fixed, progress=not output.quiet,
+                name=model.name, checkpoint=folder, resume=output.resume,
+                attributes=result_attributes(options, line, model, observed, model_options),
+                **sampling_arguments(options, model))
             partial = arviz_data.attributes(posterior).get("partial")
-            if watch is not None and partial is not None:
-                watch.dismiss()
             # The report is written last: without it the run was killed while it drew its figures.
-            if finished and partial is None and page.exists(folder):
+            if is_finished and partial is None and page.exists(folder):
                 print(f"\nthe run in {folder} is complete; nothing was changed")
                 return 0
-            seconds = time.perf_counter() - started
-            status = report(posterior, folder, seconds, arguments.overwrite or arguments.resume)
+            status = report(posterior, folder, time.perf_counter() - start_time, output.overwrite or output.resume)
         if partial is None:
             return status
-        print(f"partial  {partial}\nresume   {_resume_command(arguments, folder)}")
+        print(f"partial  {partial}\nresume   {resume}")
         return INTERRUPTED
 
 
-def _resume_command(arguments: argparse.Namespace, folder: Path) -> str:
-    """Return the command that resumes this run."""
-    line = [word for word in arguments.line if word not in ("--overwrite", "--resume")]
-    if arguments.out is None:
-        line += ["--out", str(folder)]
-    return shlex.join(["lfm-ppl", *line, "--resume"])
+def sample(*arguments: Any, **keywords: Any) -> Any:
+    """Return the result of `lfm_ppl.fit`; an unfinished run stays in the folder."""
+    return lfm_ppl.fit(*arguments, **keywords)
 
 
-def _nothing_left(folder: Path) -> str:
-    from lfm_ppl.results.files import POSTERIOR
-
-    if (folder / POSTERIOR).is_file():
+def _remains(folder: Path, resume: str) -> str:
+    """Return what an interrupted run has left."""
+    if checkpoint.has_run(folder):
+        return f"resume with: {resume}"
+    if (folder / files.POSTERIOR).is_file():
         return f"the result is complete; draw its figures with: lfm-ppl plot {folder} --overwrite"
-    with contextlib.suppress(OSError):  # raised where it is not empty
-        folder.rmdir()
     return "nothing was sampled yet"
 
 
-def _observed(arguments: argparse.Namespace, model: loading.ModelFile, options: dict[str, Any]) -> Data:
+def observed_data(options: DataOptions, model: loading.ModelFile, model_options: dict[str, Any]) -> Data:
     """Return the data of --data as the model takes them, or simulated data."""
-    if arguments.data is None:
-        for flag in ("outputs", "inputs", "time_column", "time_unit", "truth"):
-            if getattr(arguments, flag) is not None:
-                flag = flag.replace("_", "-")
-                raise ValueError(f"--{flag} is about a data file; give one with --data.")
-        return model.simulate(**options)
-    observed = read_data(arguments.data, model, arguments)
-    if arguments.truth is not None:
-        observed = dataclasses.replace(observed, truth=read_truth(arguments.truth))
+    options.columns.refuse_without("--data", options.data, time_unit=options.time_unit, truth=options.truth)
+    if options.data is None:
+        return model.simulate(**model_options)
+    observed = read_data(options.data, model, options)
+    if options.truth is not None:
+        observed = dataclasses.replace(observed, truth=read_truth(options.truth))
     return model.prepare(observed)
 
 
-def _print_task(
-    arguments: argparse.Namespace,
-    model: loading.ModelFile,
-    observed: Data,
-    options: dict[str, Any],
-    fixed: dict[str, Any],
-) -> None:
-    source = arguments.data or "simulated by the model"
-    count = np.isnan(observed.y).reshape(-1, len(observed.outputs)).sum(axis=0)
-    missing, rows = int(count.sum()), observed.y[..., 0].size
-    where = "" if len(count) == 1 else " (" + ", ".join(
-        f"{'all' if number == rows else number} of {name}"
-        for number, name in zip(count, observed.outputs, strict=True) if number) + ")"
-    size = f"{len(observed.times)} rows of {', '.join(observed.outputs)}"
+def _print_data(options: FitOptions, model: loading.ModelFile, observed: Data, fixed: dict[str, Any]) -> None:
     print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")
-    print(f"data     {source}: {size}" + (f"; {missing} values missing{where}" if missing else ""))
-    for name in np.array(observed.outputs)[count == rows]:
+    counts = dict(zip(observed.outputs, np.isnan(observed.y).reshape(-1, len(observed.outputs)).sum(axis=0),
+                      strict=True))
+    rows, missing = observed.y[..., 0].size, int(sum(counts.values()))
+    text = f"{len(observed.times)} rows of {', '.join(observed.outputs)}"
+    if missing:
+        text += f"; {missing} values missing"
+    if missing and len(counts) > 1:
+        text += " (" + ", ".join(f"{'all' if count == rows else count} of {name}"
+                                 for name, count in counts.items() if count) + ")"
+    print(f"data     {options.data.data or 'simulated by the model'}: {text}")
+    for name in (name for name, count in counts.items() if count == rows):
         print(f"note     {name} has no value: its own parameters follow the prior")
     if observed.inputs:
         print("inputs   " + ", ".join(f"{name} ({table.interpolation})" for name, table in observed.inputs.items()))
     if observed.origin is not None:
         print(f"time     in {observed.units['time']} since {observed.origin.replace('T', ' ')}")
-    for flag, sign, bounds in (("--lower", ">=", arguments.lower), ("--upper", "<=", arguments.upper)):
-        where = "" if arguments.grid is None else f" at {arguments.grid} times"
-        for name, value in (choices.bounds(flag, bounds) or {}).items():
-            print(f"bound    {name} {sign} {value:g}{where}")
-    if options:
-        print("options  " + ", ".join(f"{name} = {value}" for name, value in options.items()))
     anchors = model.anchors(observed)
     for name, value in fixed.items():
         is_anchor = name in anchors and anchors[name] == value
-        free = f" by the model; --set {name}=free frees it" if is_anchor else ""
-        print(f"fixed    {name} = {value}{free}")
+        print(f"fixed    {name} = {value}" + (f" by the model; --set {name}=free frees it" if is_anchor else ""))
+
+
+def _print_settings(options: FitOptions, model_options: dict[str, Any], observed: Data) -> None:
+    approximation, inference = options.approximation, options.inference
+    where = "" if approximation.grid is None else f" at {approximation.grid} times"
+    for flag, sign, bounds in (("--lower", ">=", approximation.lower), ("--upper", "<=", approximation.upper)):
+        for name, value in (choices.bounds(flag, bounds) or {}).items():
+            print(f"bound    {name} {sign} {value:g}{where}")
+    if model_options:
+        print("options  " + ", ".join(f"{name} = {value}" for name, value in model_options.items()))
     if observed.note:
         print(f"note     {observed.note}")
-    if arguments.sampler != "map":
-        warmup = "" if arguments.warmup is None else f" {arguments.warmup} warm-up and"
-        size = f"{arguments.chains} chains of{warmup} {arguments.samples or 1000} kept draws"
-        print(f"sampler  {arguments.sampler}, {size}")
+    if inference.sampler != "map":
+        warmup = "" if inference.warmup is None else f" {inference.warmup} warm-up and"
+        draws = inference.samples or 1000
+        print(f"sampler  {inference.sampler}, {inference.chains} chains of{warmup} {draws} kept draws")
     sys.stdout.flush()
-
-
-def _check_fixed(numpyro_model: Any, observed: Data, keywords: dict[str, Any], fixed: dict[str, Any]) -> None:
-    from lfm_ppl.inference.bind import bind
-
-    with calendar_time.in_messages(observed.origin, observed.units.get("time", "")):
-        bind(numpyro_model, observed.times, observed.y, **keywords).fix(fixed)
-
-
-def sample(
-    arguments: argparse.Namespace,
-    model: loading.ModelFile,
-    numpyro_model: Any,
-    observed: Data,
-    options: dict[str, Any],
-    fixed: dict[str, Any],
-    folder: Path,
-    requested_times: np.ndarray | None = None,
-) -> Any:
-    """Return the ArviZ object of a fit; an unfinished run stays in the folder."""
-    import lfm_ppl
-
-    return lfm_ppl.fit(
-        numpyro_model,
-        observed,
-        seed=arguments.seed,
-        at=requested_times,
-        model_kwargs=model.keywords(observed, options),
-        fixed=fixed,
-        progress=not arguments.quiet,
-        name=model.name,
-        checkpoint=folder,
-        resume=arguments.resume,
-        overwrite=arguments.overwrite,
-        attributes=result_attributes(arguments, model, observed, options),
-        **sampling_arguments(arguments, model),
-    )
 
 
 def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int:
     """Write and print the results, without figures if they are partial; return 1 if figures or report failed."""
-    from lfm_ppl.results import arviz_data, files, tables
     from lfm_ppl.results.plots import save_figures
     from lfm_ppl.results.residuals import misfit
 
     # A checkpoint has written a partial or complete result under this name.
     written = [arviz_data.save(posterior, folder / files.POSTERIOR, overwrite=True)]
-    table = arviz_data.summary(posterior)
+    table, attrs = arviz_data.summary(posterior), arviz_data.attributes(posterior)
     written.append(tables.write_csv(tables.annotated(table, posterior), folder / results.SUMMARY, overwrite))
     print(f"\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}\n")
-    status = 0
-    attrs = arviz_data.attributes(posterior)
     for message in misfit(posterior):
         print(f"note     {message}")
     figures: list[Path] = []
+    status = 0
     try:
         if "partial" not in attrs:
             figures = save_figures(posterior, folder, overwrite=overwrite)
-            written += figures
     except Exception as error:  # the draws are saved
-        print(f"lfm-ppl: the figures could not be drawn: {error}", file=sys.stderr)
-        print(f"         try again with: lfm-ppl plot {folder} --overwrite", file=sys.stderr)
+        print(f"lfm-ppl: the figures could not be drawn: {error}\n"
+              f"         try again with: lfm-ppl plot {folder} --overwrite", file=sys.stderr)
         status = 1
     if "log_likelihood_sd" in attrs:
         print(f"particles {attrs['particles']}; the log likelihood estimate has a standard deviation of "
               f"{attrs['log_likelihood_sd']:.2f} (near 1 is best)")
-    total_seconds = float(attrs.get("wall_time_s", 0.0))
-    earlier_time = (
-        f", and {duration(total_seconds - seconds)} before it was stopped"
-        if total_seconds > 1.05 * seconds + 1.0
-        else ""
-    )
-    print(f"time     {seconds:.0f} s{earlier_time}")
-    for path in written:
+    earlier = float(attrs.get("wall_time_s", 0.0)) - seconds
+    print(f"time     {seconds:.0f} s"
+          + (f", and {duration(earlier)} before it was stopped" if earlier > 0.05 * seconds + 1.0 else ""))
+    for path in (*written, *figures):
         print(f"wrote    {path}")
     return max(status, page.save(posterior, folder, overwrite, figures))

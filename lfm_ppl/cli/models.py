@@ -1,24 +1,21 @@
-"""``lfm-ppl models``: list the shipped models, or describe one."""
+"""``lfm-ppl models``: list the shipped models, or describe one from a run at the medians of its priors."""
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
 from typing import Any
 
-from lfm_ppl.cli import description
+import numpy as np
+
+from lfm_ppl.cli import session
 from lfm_ppl.io import loading
+from lfm_ppl.io.data_set import Data, InputTable
+
+_TYPES = {float: "a number", int: "a whole number", bool: "true or false"}
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Print the list, or the description of ``arguments.model``."""
-    if arguments.model is None:
-        _list()
-    else:
-        _describe(loading.load(arguments.model))
-    return 0
-
-
-def _list() -> None:
+def list_models() -> None:
+    """Print a line for each shipped model."""
     shipped = [loading.load(name) for name in loading.available()]
     width = max(len(model.name) for model in shipped)
     for model in shipped:
@@ -26,78 +23,96 @@ def _list() -> None:
     print("\n`lfm-ppl models NAME` describes one, `lfm-ppl fit NAME` runs it on simulated data.")
 
 
-def _describe(model: loading.ModelFile) -> None:
+def describe_model(name: str) -> None:
+    """Print the constants of a model file, and the parameters, forces and states of its model."""
+    model = loading.load(name)
     print(f"{model.name}  ({model.path})\n\n{model.description}\n")
-    from lfm_ppl.cli import session
+    def with_unit(name: str) -> str:
+        return f"{name} ({unit})" if (unit := model.units.get(name)) else name
 
-    session.start(1)
-    print(f"outputs: {_outputs(model)}")
+    if model.outputs is None:
+        print("outputs: any number, the columns of the data file")
+    else:
+        print("outputs: " + ", ".join(with_unit(name) for name in model.outputs))
     if model.inputs:
-        print("known inputs: " + ", ".join(f"{_with_unit(model, name)} ({way})" for name, way in model.inputs.items()))
+        print("known inputs: " + ", ".join(f"{with_unit(name)} ({way})" for name, way in model.inputs.items()))
     if unit := model.units.get("time"):
         print(f"time: in {unit}")
     print()
+    session.start(1)
     try:
-        model_description = description.describe(model)
+        bound = _bind(model)
     except Exception:  # the constants of the file describe a model that does not run
-        _table("parameters (fix one with --set NAME=VALUE)", list(model.parameters.items()))
+        _print_table("parameters (fix one with --set NAME=VALUE)", list(model.parameters.items()))
         _print_options(model)
         print("The model itself could not be run.")
         raise
-    else:
-        _print_parameters(model_description)
-        more = (
-            (("of states and forces (deterministics)", model_description.deterministics),)
-            if model_description.deterministics
-            else ()
-        )
-        for title, entries in (("forces", model_description.forces), ("states", model_description.states), *more):
-            _table(title, [(name, text) for name, text in entries.items()])
-        print(f"likelihood: {model_description.approximation}\n")
-        for table, names in model_description.unknown_names.items():
-            if names and not model.options:  # options may change the sites
-                print(f"{table} has {', '.join(names)}, which the model does not have; correct the name.\n")
+    _print_sites(model, bound)
     _print_options(model)
 
 
-def _print_options(model: loading.ModelFile) -> None:
-    rows = [(name, _option(*entry)) for name, entry in model.options.items()]
-    _table("options (choose with --option NAME=VALUE)", rows)
+def _bind(model: loading.ModelFile) -> Any:
+    """Return the bound model, with simulated data or with data of the right shape."""
+    from lfm_ppl.inference.bind import bind
 
-
-def _print_parameters(model_description: description.Description) -> None:
-    print("parameters (fix one with --set NAME=VALUE):")
-    rows = [("name", "shape", "prior", "support", ""), *model_description.parameters]
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    for row in rows:
-        cells = [f"{cell:<{width}}" for cell, width in zip(row[:4], widths, strict=True)]
-        print("  " + "  ".join([*cells, row[4]]).rstrip())
-    print()
-    if model_description.derived:
-        _table("derived from them", model_description.derived)
-
-
-def _outputs(model: loading.ModelFile) -> str:
-    if model.outputs is None:
-        return "any number, the columns of the data file"
-    return ", ".join(_with_unit(model, name) for name in model.outputs)
-
-
-def _with_unit(model: loading.ModelFile, name: str) -> str:
-    return f"{name} ({unit})" if (unit := model.units.get(name)) else name
-
-
-def _option(default: Any, accepted: tuple[Any, ...] | type, help_: str) -> str:
-    if isinstance(accepted, tuple):
-        values = ", ".join(str(value) for value in accepted)
+    if model.can_simulate:
+        data = model.simulate()
     else:
-        values = {float: "a number", int: "a whole number", bool: "true or false"}.get(accepted, "text")
-    return f"{help_}: {values} (default: {default})"
+        times, outputs = np.arange(3.0), model.outputs or ("y",)
+        inputs = {name: InputTable(times, np.ones(3), way) for name, way in model.inputs.items()}
+        data = Data(times, np.zeros((3, len(outputs))), outputs, units=model.units, inputs=inputs)
+    return bind(model.model, data.times, data.y, **model.keywords(data, {}))
 
 
-def _table(title: str, rows: list[tuple[str, str]]) -> None:
+def _print_sites(model: loading.ModelFile, bound: Any) -> None:
+    from lfm_ppl.inference.priors import prior, support
+    from lfm_ppl.results.likelihoods import is_exact
+
+    trace, example = bound.trace(), bound.site.example
+    system = example.ssm.model
+    units = {**model.units, **system.units}
+    shapes = {name: " x ".join(map(str, np.shape(site["value"]))) or "number" for name, site in trace.items()
+              if site["type"] in ("sample", "deterministic")}
+    _print_table("parameters (fix one with --set NAME=VALUE)", [("name", "shape", "prior", "support", ""), *(
+        (name, shapes[name], prior(trace[name]["fn"]), support(trace[name]["fn"].support),
+         model.parameters.get(name, "")) for name in shapes if name in bound.sites)])
+    derived = [(name, shape) for name, shape in shapes.items() if trace[name]["type"] == "deterministic"]
+    for title, rows in (
+        ("derived from them", derived),
+        ("forces", [(name, f"{type(force).__name__} {_bracketed(units, name)}") for name, force in
+                    system.forces.items()]),
+        ("states", [(name, _bracketed(units, name)) for name in system.state_names]),
+        ("of states and forces (deterministics)", [(name, _bracketed(units, name)) for name in
+                                                   system.deterministic_names]),
+    ):
+        if rows or title in ("forces", "states"):
+            _print_table(title, rows)
+    parts = [f"{example.rule.name}, {example.steps} steps", example.iterations and f"{example.iterations} iterations"]
+    text = "exact: the model is linear" if is_exact(example.ssm) else ", ".join(filter(None, parts)) + (
+        f"; sites by {example.sites_in_words}" if example.sites_in_words else "")
+    print(f"likelihood: {text}\n")
+    model_names = {"time", *model.inputs, *system.output_names, *system.state_names, *system.force_names,
+                   *system.deterministic_names, *trace}
+    for table, names in (("UNITS", set(model.units) - model_names), ("PARAMETERS", set(model.parameters) - set(trace))):
+        if names and not model.options:  # options may change the sites
+            print(f"{table} has {', '.join(sorted(names))}, which the model does not have; correct the name.\n")
+
+
+def _bracketed(units: dict[str, str], name: str) -> str:
+    return f"({unit})" if (unit := units.get(name)) else ""
+
+
+def _print_options(model: loading.ModelFile) -> None:
+    rows = []
+    for name, (default, accepted, help_) in model.options.items():
+        values = ", ".join(map(str, accepted)) if isinstance(accepted, tuple) else _TYPES.get(accepted, "text")
+        rows.append((name, f"{help_}: {values} (default: {default})"))
+    _print_table("options (choose with --option NAME=VALUE)", rows)
+
+
+def _print_table(title: str, rows: Sequence[tuple[str, ...]]) -> None:
     print(f"{title}:")
-    width = max((len(name) for name, _ in rows), default=0)
-    for name, help_ in rows:
-        print(f"  {name:<{width}}  {help_}")
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
     print("" if rows else "  none\n")

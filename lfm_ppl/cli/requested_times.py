@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lfm_ppl.cli.options import Times
 from lfm_ppl.io.data_set import Data
 from lfm_ppl.utils import calendar_time
 
@@ -11,41 +12,36 @@ _TRAJECTORY_TIMES = 241
 """Number of times of the trajectories between the first and the last one: enough for a smooth line."""
 
 
-def trajectory_times(observed: Data, until: str | None, at: str | None) -> np.ndarray | None:
+def trajectory_times(observed: Data, requests: Times) -> np.ndarray | None:
     """Return the times of the trajectories; None without --until and --at, for the library's grid."""
-    if until is None and at is None:
+    if requests == Times():
         return None
-    times = observed.times
-    time_requests = requested_times(observed, until, at, 2, times)
-    return np.union1d(np.linspace(times[0], max(time_requests[-1], times[-1]), _TRAJECTORY_TIMES), time_requests)
+    times = np.union1d(observed.times, requested_times(observed, requests, 2))
+    return np.union1d(np.linspace(observed.times[0], times[-1], _TRAJECTORY_TIMES), times)
 
 
-def requested_times(observed: Data, until: str | None, at: str | None, grid: int,
-                    further: np.ndarray) -> np.ndarray:
-    """Return the times of --until and --at, numbers or dates, and ``further`` times, sorted.
+def requested_times(observed: Data, requests: Times, grid: int) -> np.ndarray:
+    """Return the times of --at and the ``grid`` times to --until, sorted.
 
     Raises:
         ValueError: neither a number nor a date; --until is not after the last observation.
     """
-    last = observed.times[-1]
-    hint = ". Separate times by commas."
-    at_times = [_parse_time("--at", text, observed, hint) for text in (at or "").split(",") if at]
-    if not np.isfinite(at_times).all():
-        raise ValueError(f"--at takes finite times, separated by commas, got {at}.")
-    groups = [further, np.array(at_times)]
-    if until is not None:
-        end = _parse_time("--until", until, observed)
-        if not (np.isfinite(end) and end > last):
-            last_time = f"{last:g}"
-            if observed.origin is not None:
-                last_time = calendar_time.clock(last, observed.origin, observed.units["time"], "T")
-            raise ValueError(f"--until takes a time after the last observation, at {last_time}, got {until}.")
-        groups.append(np.linspace(last, end, grid))
-    return np.unique(np.concatenate(groups))
+    times = [_parse_time("--at", text, observed) for text in (requests.at or "").split(",") if requests.at]
+    if not np.isfinite(times).all():
+        raise ValueError(f"--at takes finite times, separated by commas, got {requests.at}.")
+    if requests.until is None:
+        return np.unique(times)
+    last, end = observed.times[-1], _parse_time("--until", requests.until, observed)
+    if not (np.isfinite(end) and end > last):
+        last_time = f"{last:g}" if observed.origin is None else calendar_time.clock(
+            last, observed.origin, observed.units["time"], "T")
+        raise ValueError(f"--until takes a time after the last observation, at {last_time}, got {requests.until}.")
+    return np.union1d(times, np.linspace(last, end, grid))
 
 
-def _parse_time(flag: str, text: str, observed: Data, hint: str = "") -> float:
+def _parse_time(flag: str, text: str, observed: Data) -> float:
     try:
         return calendar_time.position(text, observed.origin, observed.units.get("time", ""))
     except ValueError as error:
-        raise ValueError(f"{flag}: {str(error).rstrip('.')}{hint or '.'}") from None
+        hint = " Separate times by commas." if flag == "--at" else ""
+        raise ValueError(f"{flag}: {str(error).rstrip('.')}.{hint}") from None

@@ -44,8 +44,9 @@ def start(chains: int, keep_programs: bool = True, one_thread: bool = False) -> 
     numpyro.set_host_device_count(min(chains, _MOST_DEVICES))
     if keep_programs and not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
         folder = cache_folder()
-        if folder is not None and _ready(folder):
+        if folder is not None and _is_ready(folder):
             jax.config.update("jax_compilation_cache_dir", str(folder))
+            jax.config.update("jax_compilation_cache_max_size", _LARGEST)
             jax.config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_S)
 
 
@@ -60,10 +61,7 @@ def cache_folder() -> Path | None:
         return None
     base = os.environ.get("XDG_CACHE_HOME", "")
     if not os.path.isabs(base):  # the XDG specification ignores relative paths
-        try:
-            base = str(Path.home() / ".cache")
-        except RuntimeError:  # no home directory
-            return None
+        base = os.path.expanduser("~/.cache")
     return Path(base) / "lfm_ppl" / hashlib.sha256(_cpu().encode()).hexdigest()[:12]
 
 
@@ -76,38 +74,17 @@ def _cpu() -> str:
     return f"{platform.machine()} {platform.processor()}"
 
 
-def _ready(folder: Path) -> bool:
-    """Make the folder, writable by its owner only since its programs are executed, and prune it; warn on failure."""
+def _is_ready(folder: Path) -> bool:
+    """Make the folder, writable by its owner only since its programs are executed; warn on failure."""
     try:
-        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        folder.mkdir(mode=0o700, exist_ok=True)
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise PermissionError(f"no permission to write to {folder}")
+        for path in (folder.parent, folder):
+            path.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = folder.stat()
-        if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):
-            raise PermissionError(f"others may write to {folder}, whose programs are executed")
+        owner = getattr(os, "getuid", lambda: status.st_uid)()
+        if not os.access(folder, os.W_OK | os.X_OK) or status.st_uid != owner or status.st_mode & 0o022:
+            raise PermissionError(f"{folder} is not writable by this user alone")
     except OSError as error:
-        warnings.warn(f"compiled programs are not cached: {error}. {SWITCH}=off or --no-cache silences "
-                      "this.", stacklevel=3)
+        warnings.warn(f"compiled programs are not cached: {error}. {SWITCH}=off or --no-cache silences this.",
+                      stacklevel=3)
         return False
-    prune(folder.parent, _LARGEST)
     return True
-
-
-def prune(folder: Path, largest: int) -> None:
-    """Remove the least recently used programs until ``folder`` takes at most ``largest`` bytes.
-
-    (JAX can bound its cache itself, but with another dependency and a lock around every access.)
-    """
-    programs = []
-    for path in folder.glob("*/*-cache"):
-        with contextlib.suppress(OSError):  # another process may have removed it
-            status = path.stat()
-            programs.append((max(status.st_atime, status.st_mtime), status.st_size, path))
-    total = sum(size for _, size, _ in programs)
-    for _, size, path in sorted(programs):
-        if total <= largest:
-            break
-        with contextlib.suppress(OSError):
-            path.unlink()
-            total -= size

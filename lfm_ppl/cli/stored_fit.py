@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -75,13 +76,8 @@ def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit
 
 
 def _json_attribute(attrs: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
-    """Return what an attribute of a result holds as JSON."""
-    try:
-        value = json.loads(attrs.get(name) or "{}")
-    except ValueError as error:
-        raise ValueError(f"{path}: its attribute {name} cannot be read ({error}); the file was changed since `lfm-ppl "
-                         "fit` wrote it.") from None
-    if not isinstance(value, dict):
-        raise ValueError(f"{path}: its attribute {name} is no mapping; the file was changed since `lfm-ppl fit` wrote "
-                         "it.")
-    return value
+    """Return a mapping that an attribute of a result holds as JSON."""
+    with contextlib.suppress(ValueError):
+        if isinstance(value := json.loads(attrs.get(name) or "{}"), dict):
+            return value
+    raise ValueError(f"{path}: its attribute {name} cannot be read; the file was changed since `lfm-ppl fit` wrote it.")

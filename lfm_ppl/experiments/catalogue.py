@@ -6,8 +6,6 @@ import importlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from lfm_ppl.utils import checks
-
 if TYPE_CHECKING:  # the import takes a second
     from lfm_ppl.experiments.study import Study
 
@@ -71,5 +69,7 @@ def experiment(name: str) -> CatalogueEntry:
     """
     canonical = name.replace("_", "-")
     if canonical not in _STUDIES:
+        from lfm_ppl.utils import checks  # which imports JAX, for which the help of the command line would wait
+
         raise ValueError(checks.unknown("experiment", name, _STUDIES))
     return CatalogueEntry(canonical, _STUDIES[canonical][1])

@@ -122,71 +122,6 @@ def setting(default: Any, help: str, **declaration: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class SettingOption:
-    """A setting as an option of the command line.
-
-    Attributes:
-        name: name of the field.
-        value_type: int, float or str; the type of the entries if the value is a tuple.
-        is_sequence: whether the value is a tuple of any length.
-        is_optional: whether the value may be None.
-        default: default value.
-        declaration: description by the study.
-    """
-
-    name: str
-    value_type: type
-    is_sequence: bool
-    is_optional: bool
-    default: Any
-    declaration: SettingDeclaration
-
-    @property
-    def flags(self) -> list[str]:
-        """Names of the option on the command line."""
-        return list(dict.fromkeys([f"--{self.name.replace('_', '-')}", *self.declaration.aliases]))
-
-    def check(self, value: Any) -> None:
-        """Raise ValueError or TypeError, naming the setting, for a value that is not permitted."""
-        declaration = self.declaration
-        if value is None and self.is_optional:
-            return
-        if declaration.parts:
-            checks.sizes(self.name, value, declaration.parts)
-        elif self.is_sequence:
-            self._check_sequence(value)
-        elif self.value_type is int:
-            self._check_count(value)
-        elif self.value_type is float:
-            checks.positive(self.name, value, f"See {self.flags[0]}.")
-        elif declaration.choices:
-            checks.one_of(self.name, value, declaration.choices)
-
-    def _check_sequence(self, value: Any) -> None:
-        declaration, entries = self.declaration, "numbers" if self.value_type is int else "labels"
-        is_nonempty = isinstance(value, tuple) and len(value) > 0
-        if declaration.increasing and not (is_nonempty and list(value) == sorted(set(value))):
-            raise ValueError(f"{self.name} must be a tuple of increasing numbers, got {value!r}.")
-        if not is_nonempty or (self.value_type is int or declaration.choices) and len(set(value)) < len(value):
-            raise ValueError(f"{self.name} must be a tuple of different {entries}, at least one, got {value!r}.")
-        for entry in value:
-            if self.value_type is int:
-                self._check_count(entry)
-            elif declaration.choices:
-                checks.one_of(self.name, entry, declaration.choices)
-
-    def _check_count(self, value: Any) -> None:
-        declaration = self.declaration
-        if declaration.least > 0 or not isinstance(value, int):
-            checks.positive_integer(self.name, value)
-        if value < declaration.least:
-            raise ValueError(f"{self.name} must be at least {declaration.least}, got {value}.")
-        if declaration.per_seed is not None and value > declaration.per_seed:
-            raise ValueError(f"{self.name} is {value}, but one seed has {declaration.per_seed} data sets; use "
-                             "several seeds for more.")
-
-
-@dataclass(frozen=True)
 class StudySettings:
     """Settings of any study; a study subclasses this and adds its fields."""
 
@@ -195,8 +130,8 @@ class StudySettings:
 
     def __post_init__(self) -> None:
         """Check every setting separately; a subclass adds checks that involve several settings."""
-        for option in options(type(self)):
-            option.check(getattr(self, option.name))
+        for field, value_type in option_fields(type(self)):
+            _check(field, value_type, getattr(self, field.name))
 
     @classmethod
     def quick(cls, **overrides: Any) -> Self:
@@ -211,20 +146,56 @@ class StudySettings:
         return cls.quick(**values) if quick else cls(**values)
 
 
-def options(settings: type[StudySettings]) -> tuple[SettingOption, ...]:
-    """Return the options of the command line, in the order of the fields, with the seed last."""
-    hints, settable = typing.get_type_hints(settings), []
-    for field in dataclasses.fields(settings):
-        if (declaration := field.metadata.get("declaration")) is None or not declaration.help:
-            continue
-        annotations = [hints[field.name]]
-        if isinstance(hints[field.name], types.UnionType):
-            annotations = [hint for hint in typing.get_args(hints[field.name]) if hint is not types.NoneType]
-        is_tuple = typing.get_origin(annotations[0]) is tuple
-        value_type = typing.get_args(annotations[0])[0] if is_tuple else annotations[0]
-        settable.append(SettingOption(field.name, value_type, is_tuple and not declaration.parts,
-                                      hints[field.name] != annotations[0], field.default, declaration))
-    return tuple(sorted(settable, key=lambda option: option.name == "seed"))
+def option_fields(settings: type[StudySettings]) -> list[tuple[dataclasses.Field, Any]]:
+    """Return the fields that are options of the command line, with their types without None; the seed is last."""
+    hints = typing.get_type_hints(settings)
+    fields = [field for field in dataclasses.fields(settings) if field.metadata and field.metadata["declaration"].help]
+    fields.sort(key=lambda field: field.name == "seed")
+    members = {field.name: typing.get_args(hint) if isinstance(hint := hints[field.name], types.UnionType) else [hint]
+               for field in fields}
+    return [(field, next(member for member in members[field.name] if member is not types.NoneType))
+            for field in fields]
+
+
+def _check(field: dataclasses.Field, value_type: Any, value: Any) -> None:
+    """Raise ValueError or TypeError, naming the setting, for a value that is not permitted."""
+    declaration: SettingDeclaration = field.metadata["declaration"]
+    if value is None and field.default is None:
+        return
+    if declaration.parts:
+        checks.sizes(field.name, value, declaration.parts)
+    elif typing.get_origin(value_type) is tuple:
+        _check_sequence(field.name, typing.get_args(value_type)[0], value, declaration)
+    elif value_type is int:
+        _check_count(field.name, value, declaration)
+    elif value_type is float:
+        checks.positive(field.name, value)
+    elif declaration.choices:
+        checks.one_of(field.name, value, declaration.choices)
+
+
+def _check_sequence(name: str, entry_type: type, value: Any, declaration: SettingDeclaration) -> None:
+    is_nonempty = isinstance(value, tuple) and len(value) > 0
+    if declaration.increasing and not (is_nonempty and list(value) == sorted(set(value))):
+        raise ValueError(f"{name} must be a tuple of increasing numbers, got {value!r}.")
+    if not is_nonempty or (entry_type is int or declaration.choices) and len(set(value)) < len(value):
+        entries = "numbers" if entry_type is int else "labels"
+        raise ValueError(f"{name} must be a tuple of different {entries}, at least one, got {value!r}.")
+    for entry in value:
+        if entry_type is int:
+            _check_count(name, entry, declaration)
+        elif declaration.choices:
+            checks.one_of(name, entry, declaration.choices)
+
+
+def _check_count(name: str, value: Any, declaration: SettingDeclaration) -> None:
+    if declaration.least > 0 or not isinstance(value, int):
+        checks.positive_integer(name, value)
+    if value < declaration.least:
+        raise ValueError(f"{name} must be at least {declaration.least}, got {value}.")
+    if declaration.per_seed is not None and value > declaration.per_seed:
+        raise ValueError(f"{name} is {value}, but one seed has {declaration.per_seed} data sets; use several seeds for "
+                         "more.")
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from references import gauss_hermite
 from rules import RULES
 
 import lfm_ppl as lfm
-from lfm_ppl.cli import choices
+from lfm_ppl.cli import options
 from lfm_ppl.linearisation.rule import Inputs
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.linearisation.structure import InputStructure
@@ -26,7 +26,7 @@ def test_every_public_rule_is_in_the_list_and_has_a_word_on_the_command_line():
     public = {name: getattr(lfm, name) for name in lfm.__all__}
     kinds = {name for name, one in public.items() if isinstance(one, type) and issubclass(one, lfm.Rule)} - {"Rule"}
     assert kinds == {type(rule).__name__ for rule in RULES}, "add it to tests/rules.py"
-    assert kinds == set(choices.RULES.values()), "give it a word in RULES of lfm_ppl/cli/choices.py"
+    assert kinds == set(options.RULES.values()), "give it a word in RULES of lfm_ppl/cli/options.py"
 
 
 def structure(points, averaged=(), constant=()):
