@@ -186,8 +186,8 @@ def widening(x, u, t):
     return jnp.diag(jnp.array([0.2, 0.3])) + 0.1 * jnp.ones((2, 2)) * (1.0 + x[0] ** 2)
 
 
-@pytest.mark.parametrize("y", [[1.2, 3.0], [np.nan, 3.0], [1.2, np.nan]])
-@pytest.mark.parametrize("angular", [(), (1,)])
+@pytest.mark.parametrize("y, angular", [([1.2, 3.0], (1,)), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
+    ([1.2, 3.0], ()), ([np.nan, 3.0], (1,)), ([1.2, np.nan], (1,))))])
 def test_likelihood_of_several_outputs_against_quadrature(y, angular):
     y = np.array(y)
     model = lfm.LatentForceModel(zero_drift, {}, lfm.GaussianObservation(state_and_angle, widening, angular),
@@ -207,6 +207,7 @@ def test_likelihood_of_several_outputs_against_quadrature(y, angular):
     assert abs(float(result.log_likelihood[0]) - np.log((prior * likelihood).sum() * (x[1] - x[0]))) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_likelihood_as_narrow_as_a_cell_is_integrated():
     grid = Grid(-5.0, 5.0, 100)
     for sd in (0.05, 0.025):
@@ -219,6 +220,7 @@ def test_a_likelihood_as_narrow_as_a_cell_is_integrated():
             assert abs(float(value) - exact) < 0.035
 
 
+@pytest.mark.slow
 def test_an_outlier_keeps_its_likelihood():
     model = ornstein_uhlenbeck()
     times, y = [0.0, 0.5, 1.0], np.array([[0.2], [12.0], [0.3]])
@@ -232,12 +234,11 @@ def test_an_outlier_keeps_its_likelihood():
 
 
 def parameters(theta):
-    return double_well(mean=0.9, variance=0.05, dispersion=theta[1], noise=0.04, b=theta[0])
+    return double_well(mean=0.9, variance=0.05, dispersion=theta[1], noise=theta[2], b=theta[0])
 
 
-@pytest.mark.parametrize("times", [
-    pytest.param(WELL_TIMES, id="equal intervals", marks=pytest.mark.slow),
-    pytest.param(WELL_TIMES**1.1, id="any intervals")])
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [WELL_TIMES, WELL_TIMES**1.1], ids=["equal intervals", "any intervals"])
 def test_batches_and_vmap_equal_loops(times):
     ssm, grid = lfm.state_space(WELL), Grid(-3.0, 3.0, 60)
     time_grid = build_time_grid(ssm, times, 1)
@@ -246,32 +247,25 @@ def test_batches_and_vmap_equal_loops(times):
     np.testing.assert_allclose(run(sets), [run(y) for y in sets], rtol=1e-12)
     log_density = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid,
                                                        jnp.asarray(WELL_Y), grid))
-    thetas = jnp.array([[1.5, 0.8], [0.7, 1.1], [2.0, 0.3]])
+    thetas = jnp.array([[1.5, 0.8, 0.04], [0.7, 1.1, 0.04], [2.0, 0.3, 0.04]])
     loop = [log_density(theta) for theta in thetas]
     np.testing.assert_allclose(jax.jit(jax.vmap(log_density))(thetas), loop, rtol=1e-12)
     np.testing.assert_allclose(jax.jit(lambda t: jax.lax.map(log_density, t))(thetas), loop, rtol=1e-12)
 
 
-def test_derivatives_in_forward_mode():
+def test_derivatives_in_forward_mode_and_failure():
+    """Failure in compiled code is minus infinity."""
     ssm, grid = lfm.state_space(WELL), Grid(-3.0, 3.0, 60)
     time_grid = build_time_grid(ssm, WELL_TIMES, 1)
     log_density = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid,
                                                        jnp.asarray(WELL_Y), grid))
-    theta = jnp.array([1.5, 0.8])
+    theta = jnp.array([1.5, 0.8, 0.04])
     slope = jax.jit(jax.jacfwd(log_density))(theta)
-    for index, step in enumerate(1e-5 * np.eye(2)):
+    for index, step in enumerate(1e-5 * np.eye(3)):
         difference = log_density(theta + step) - log_density(theta - step)
         np.testing.assert_allclose(slope[index], difference / 2e-5, rtol=1e-5)
-
-
-def test_failure_in_compiled_code_is_minus_infinity():
-    ssm, grid = lfm.state_space(WELL), Grid(-3.0, 3.0, 40)
-    time_grid = build_time_grid(ssm, WELL_TIMES, 1)
-    run = jax.jit(lambda b, noise: log_likelihood(
-        lfm.state_space(double_well(noise=noise, b=b)), time_grid, jnp.asarray(WELL_Y), grid))
-    assert np.isfinite(run(1.0, 0.1))
-    for bad in ((np.nan, 0.1), (1.0, 0.0), (np.inf, 0.1), (1.0, np.nan)):
-        assert run(*bad) == -np.inf
+    for bad in ((np.nan, 0.8, 0.1), (1.0, 0.8, 0.0), (np.inf, 0.8, 0.1), (1.0, 0.8, np.nan)):
+        assert log_density(np.array(bad)) == -np.inf
 
 
 @pytest.mark.slow
@@ -292,7 +286,7 @@ def test_the_chosen_grid_is_as_accurate_as_asked():
 
 @pytest.mark.slow
 def test_one_grid_for_several_models_and_data_sets():
-    models = [parameters(theta) for theta in ((1.5, 0.8), (0.5, 1.0))]
+    models = [parameters(theta) for theta in ((1.5, 0.8, 0.04), (0.5, 1.0, 0.04))]
     sets = np.stack([WELL_Y, -WELL_Y])
     shared = choose_grid(models, WELL_TIMES, sets, tolerance=5e-3)
     alone = [choose_grid(model, WELL_TIMES, y, tolerance=5e-3) for model in models for y in sets]
@@ -300,6 +294,7 @@ def test_one_grid_for_several_models_and_data_sets():
     assert shared.cells >= min(g.cells for g in alone)
 
 
+@pytest.mark.slow
 def test_what_a_wide_prior_loses_outside_the_grid_is_not_lost_in_the_likelihood():
     model = double_well(mean=0.0, variance=10.0, noise=0.01)
     y = [[1.3], [1.0]]
@@ -311,44 +306,10 @@ def test_what_a_wide_prior_loses_outside_the_grid_is_not_lost_in_the_likelihood(
     assert abs(float(result.log_likelihood[0]) - exact) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_warning_where_the_grid_is_too_coarse():
-    with pytest.warns(UserWarning, match="estimated discretisation error .* above the tolerance 1e-06, with 60 cells"):
+    with pytest.warns(UserWarning, match="1e-06.* 60 cells"):
         fokker_planck(WELL, WELL_TIMES, WELL_Y, cells=60, bounds=(-3.0, 3.0), tolerance=1e-6)
-
-
-def root(x, u, t):
-    return jnp.reshape(jnp.sqrt(x), (1, 1))
-
-
-def exploding(x, u, t):
-    return x**3
-
-
-@pytest.mark.parametrize("options, message", [
-    ({"cells": 0}, "cells must be at least 1, got 0"),
-    ({"cells": 4}, "cells must be at least 8 to hold a density, got 4"),
-    ({"bounds": (1.0, -1.0)}, r"bounds must be \(low, high\) with low < high, got \(1, -1\)"),
-    ({"bounds": (0.0,)}, "bounds must be two numbers"),
-    ({"bounds": (0.0, np.inf)}, "bounds must be finite"),
-    ({"bounds": (5.0, 9.0)}, r"bounds=\(5, 9\) hold only .* of the initial probability, whose mean is 0.9. Widen"),
-    ({"tolerance": 0.0}, "tolerance must be finite and greater than zero"),
-    ({"steps": 0}, "steps must be at least 1"),
-    ({"at": [-1.0]}, r"at\[0\] = -1 lies before the initial time"),
-])
-def test_bad_options(options, message):
-    with pytest.raises(ValueError, match=message):
-        fokker_planck(WELL, WELL_TIMES, WELL_Y, **options)
-
-
-@pytest.mark.parametrize("times, y, message", [
-    ([1.0, 0.5], np.ones((2, 1)), "times must not go back"),
-    ([1.0, 2.0], np.ones((3, 1)), r"y must have one row for each of the 2 times"),
-    ([1.0, 2.0], np.full((2, 1), np.nan), "every entry of y is missing"),
-])
-def test_bad_data(times, y, message):
-    for function in (fokker_planck, choose_grid):
-        with pytest.raises(ValueError, match=message):
-            function(WELL, times, y)
 
 
 def simple(drift=linear, start=1.0, variance=0.1, process_noise=None, noise=0.1, forces=None):
@@ -356,38 +317,43 @@ def simple(drift=linear, start=1.0, variance=0.1, process_noise=None, noise=0.1,
                                 lfm.Gaussian([start], [variance]), process_noise=process_noise)
 
 
-@pytest.mark.parametrize("model, message", [
-    (lfm.LatentForceModel(linear, {}, lfm.GaussianObservation(first_state, jnp.array([0.1])),
-                          lfm.Gaussian(jnp.zeros(2), jnp.eye(2)), process_noise=jnp.eye(2)),
-     r"joint state of this model has 2: 2 physical \(x0, x1\) and 0 of forces \(none\). Use the particle"),
-    (simple(forces={"u": lfm.Matern(1.0, 1.0)}, noise=jnp.array([0.1])), "has 3: 1 physical .* and 2 of forces"),
-    (simple(noise=jnp.array([0.1])), "process_noise is zero: without noise the state has no density"),
-    (simple(process_noise=jnp.zeros((1, 1)), noise=jnp.array([0.1])), "process_noise is zero"),
-    (simple(process_noise=lambda x, u, t: jnp.zeros((1, 1)), noise=jnp.array([0.1])), "noise is zero everywhere"),
-    (only(lfm.Constant(1.0)), "the force 'u' has no noise"),
-    (simple(process_noise=jnp.eye(1), noise=jnp.array([0.0])), "noise of 'y0' is zero"),
-    (simple(process_noise=jnp.eye(1), noise=lambda x, u, t: jnp.zeros(1)), "noise of 'y0' is zero"),
-    (simple(process_noise=root, noise=jnp.array([0.1])), r"not finite near x = -.*Give bounds"),
-])
-def test_models_without_a_density(model, message):
-    for function in (fokker_planck, choose_grid):
-        with pytest.raises(ValueError, match=message):
-            function(model, [0.0, 1.0], np.ones((2, 1)))
+def test_bad_arguments_are_named():
+    for options, name in (
+            ({"cells": 0}, "cells"), ({"cells": 4}, "cells"), ({"bounds": (1.0, -1.0)}, "bounds"),
+            ({"bounds": (0.0,)}, "bounds"), ({"bounds": (0.0, np.inf)}, "bounds"), ({"bounds": (5.0, 9.0)}, "bounds"),
+            ({"tolerance": 0.0}, "tolerance"), ({"steps": 0}, "steps"), ({"at": [-1.0]}, r"at\[0\]"),
+            ({"times": WELL_TIMES[::-1]}, "times"), ({"y": np.ones((3, 1))}, r"\(3, 1\)"),
+            ({"y": np.full((6, 1), np.nan)}, "y")):
+        with pytest.raises(ValueError, match=name):
+            fokker_planck(WELL, **{"times": WELL_TIMES, "y": WELL_Y, **options})
+    with pytest.raises(TypeError, match="model"):
+        fokker_planck("model", WELL_TIMES, WELL_Y)
+    with pytest.raises(TypeError, match="cells"):
+        fokker_planck(WELL, WELL_TIMES, WELL_Y, cells=10.5)
+    with pytest.raises(ValueError, match="model"):
+        choose_grid([], WELL_TIMES, WELL_Y)
+    with pytest.raises(ValueError, match="parameters"):
+        jax.jit(lambda b: choose_grid(double_well(b=b), WELL_TIMES, WELL_Y).low)(1.0)
+
+
+def test_models_without_a_density_are_named():
+    for model, name in (
+            (lfm.LatentForceModel(linear, {}, lfm.GaussianObservation(first_state, jnp.array([0.1])), lfm.Gaussian(
+                jnp.zeros(2), jnp.eye(2)), process_noise=jnp.eye(2)), "x0, x1"),
+            (simple(forces={"u": lfm.Matern(1.0, 1.0)}, noise=jnp.array([0.1])), "3"),
+            (simple(noise=jnp.array([0.1])), "process_noise"),
+            (simple(process_noise=jnp.zeros((1, 1)), noise=jnp.array([0.1])), "process_noise"),
+            (simple(process_noise=lambda x, u, t: jnp.zeros((1, 1)), noise=jnp.array([0.1])), "noise"),
+            (only(lfm.Constant(1.0)), "'u'"),
+            (simple(process_noise=jnp.eye(1), noise=jnp.array([0.0])), "'y0'"),
+            (simple(process_noise=jnp.eye(1), noise=lambda x, u, t: jnp.zeros(1)), "'y0'"),
+            (simple(process_noise=lambda x, u, t: jnp.sqrt(x)[None], noise=jnp.array([0.1])), "bounds")):
+        with pytest.raises(ValueError, match=name):
+            fokker_planck(model, [0.0, 1.0], np.ones((2, 1)))
 
 
 @pytest.mark.slow
 def test_a_state_that_runs_away_has_no_bounds():
-    model = simple(exploding, start=0.0, variance=1.0, process_noise=jnp.eye(1), noise=jnp.array([1e4]))
-    with pytest.raises(ValueError, match="no bounds hold the density|not finite near|filter failed"):
+    model = simple(lambda x, u, t: x**3, start=0.0, variance=1.0, process_noise=jnp.eye(1), noise=jnp.array([1e4]))
+    with pytest.raises(ValueError):
         fokker_planck(model, [0.0, 5.0], np.ones((2, 1)))
-
-
-def test_types():
-    with pytest.raises(TypeError, match="model must be an lfm.LatentForceModel, got str"):
-        fokker_planck("model", WELL_TIMES, WELL_Y)
-    with pytest.raises(ValueError, match="at least one model"):
-        choose_grid([], WELL_TIMES, WELL_Y)
-    with pytest.raises(TypeError, match="cells must be a whole number"):
-        fokker_planck(WELL, WELL_TIMES, WELL_Y, cells=10.5)
-    with pytest.raises(ValueError, match="parameters of the model must be known"):
-        jax.jit(lambda b: choose_grid(double_well(b=b), WELL_TIMES, WELL_Y).low)(1.0)
