@@ -29,7 +29,7 @@ def observed(model, seed=0):
 
 
 @pytest.mark.parametrize("method, variance", [
-    *((method, 0.0) for method in METHODS), *(pytest.param(method, 0.3, marks=pytest.mark.slow) for method in METHODS)])
+    (METHODS[0], 0.3), *(pytest.param(method, 0.0, marks=pytest.mark.slow) for method in METHODS)])
 def test_it_is_exact_for_a_linear_model(method, variance):
     """Dense algebra on the same grid: mean, covariance and marginal likelihood, in one step."""
     model = genes(lambda u: u, variance)
@@ -83,6 +83,7 @@ def test_the_mode_is_that_of_a_general_optimiser(link):
     assert np.isclose(result.log_marginal, -best.fun - 0.5 * np.linalg.slogdet(numeric)[1], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_newton_may_end_at_no_mode_and_says_so():
     """Far from the mode the exponential's curvature is not that of a maximum; the trust region does not mind."""
     failed = 0
@@ -100,14 +101,11 @@ def test_newton_may_end_at_no_mode_and_says_so():
     assert failed > 0
 
 
-@pytest.mark.parametrize("change, error, message", [
-    ({"method": "newtom"}, ValueError, "unknown method 'newtom'"),
-    ({"iterations": 0}, ValueError, "iterations"),
-    ({"tolerance": 0.0}, ValueError, "tolerance"),
-    ({"y": np.zeros((3, 2))}, ValueError, "one row for each"),
-    ({"latent": genes(jnp.exp)}, TypeError, "latent must be a lfm.LatentGrid"),
-])
-def test_errors(change, error, message):
-    arguments = {"latent": LatentGrid(genes(jnp.exp), TIMES, 11), "y": np.zeros((7, 2))} | change
-    with pytest.raises(error, match=message):
-        laplace(arguments.pop("latent"), arguments.pop("y"), **arguments)
+def test_errors():
+    for change, error, name in (
+            ({"method": "newtom"}, ValueError, "'newtom'"), ({"iterations": 0}, ValueError, "iterations"),
+            ({"tolerance": 0.0}, ValueError, "tolerance"), ({"y": np.zeros((3, 2))}, ValueError, r"\(3, 2\)"),
+            ({"latent": genes(jnp.exp)}, TypeError, "latent")):
+        arguments = {"latent": LatentGrid(genes(jnp.exp), TIMES, 11), "y": np.zeros((7, 2))} | change
+        with pytest.raises(error, match=name):
+            laplace(arguments.pop("latent"), arguments.pop("y"), **arguments)
