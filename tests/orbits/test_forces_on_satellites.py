@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +19,9 @@ erfa = pytest.importorskip("erfa", reason="needs the extra gps")
 EPOCH = orbits.gps_seconds(2019, 4, 7)
 PLACES = np.array([[7000.0, 0.0, 100.0], [-15_000.0, 12_000.0, 18_000.0], [10.0, 20.0, 26_560.0]])
 SUN, MOON = np.array([1.45e8, 3.1e7, 1.3e7]), np.array([2.1e5, 3.0e5, 1.1e5])
+
+
+ACCELERATION = jax.jit(geopotential.acceleration, static_argnums=1)
 
 
 def gradient(potential, r, h=1.0):
@@ -40,14 +45,14 @@ def potential(r, degree):
         for n in range(degree + 1) for m in range(n + 1))
 
 
-@pytest.mark.parametrize("degree", [0, 2, 8])
-@pytest.mark.parametrize("r", PLACES)
-def test_gravity_is_the_gradient_of_the_potential(r, degree):
-    result = np.asarray(jax.jit(geopotential.acceleration, static_argnums=1)(r, degree))
-    whole = gradient(lambda p: potential(p, degree), r)
-    assert np.abs(result - whole).max() < 1e-8 * np.linalg.norm(whole)
-    if degree == 0:
-        np.testing.assert_allclose(result, -geopotential.GM * r / np.linalg.norm(r) ** 3, rtol=1e-14)
+@pytest.mark.parametrize("degree", [0, pytest.param(2, marks=pytest.mark.slow), 8])
+def test_gravity_is_the_gradient_of_the_potential(degree):
+    for r in PLACES:
+        result = np.asarray(ACCELERATION(r, degree))
+        whole = gradient(lambda p: potential(p, degree), r)
+        assert np.abs(result - whole).max() < 1e-8 * np.linalg.norm(whole)
+        if degree == 0:
+            np.testing.assert_allclose(result, -geopotential.GM * r / np.linalg.norm(r) ** 3, rtol=1e-14)
 
 
 def test_gravity_has_a_gradient_at_the_pole():
@@ -57,18 +62,17 @@ def test_gravity_has_a_gradient_at_the_pole():
         geopotential.acceleration(jnp.ones(3), 9)
 
 
-@pytest.mark.parametrize("body", [SUN, MOON])
-@pytest.mark.parametrize("r", PLACES)
-def test_a_body_pulls_the_satellite_more_than_the_earth(r, body):
-    wide = [np.array(a, np.longdouble) for a in (r, body)]
-    away = wide[1] - wide[0]
-    expected = away / np.sqrt((away**2).sum()) ** 3 - wide[1] / np.sqrt((wide[1] ** 2).sum()) ** 3
-    result = np.asarray(bodies.attraction(jnp.asarray(r), jnp.asarray(body), 1.0))
-    np.testing.assert_allclose(result, expected.astype(float), rtol=1e-11, atol=1e-14 * np.abs(expected).max())
+def test_a_body_pulls_the_satellite_more_than_the_earth():
+    attraction = jax.jit(bodies.attraction)
+    for r, body in itertools.product(PLACES, (SUN, MOON)):
+        wide = [np.array(a, np.longdouble) for a in (r, body)]
+        away = wide[1] - wide[0]
+        expected = away / np.sqrt((away**2).sum()) ** 3 - wide[1] / np.sqrt((wide[1] ** 2).sum()) ** 3
+        np.testing.assert_allclose(attraction(r, body, 1.0), expected.astype(float), rtol=1e-11,
+                                   atol=1e-14 * float(np.abs(expected).max()))
 
 
-@pytest.mark.parametrize("r", PLACES)
-def test_the_tide_is_the_gradient_of_its_potential(r):
+def test_the_tide_is_the_gradient_of_its_potential():
     """k2 GM/s^3 R^5/r^3 P2(cos theta)."""
     distance = np.linalg.norm(MOON)
 
@@ -77,31 +81,32 @@ def test_the_tide_is_the_gradient_of_its_potential(r):
         return (bodies.LOVE_NUMBER * bodies.GM_MOON * geopotential.RADIUS**5 / distance**3
                 / np.linalg.norm(p) ** 3 * (1.5 * cosine**2 - 0.5))
 
-    result = bodies.solid_tide(jnp.asarray(r), jnp.asarray(MOON), bodies.GM_MOON)
-    np.testing.assert_allclose(result, gradient(raised, r), rtol=1e-6, atol=1e-8 * np.abs(result).max())
+    tide = jax.jit(bodies.solid_tide)
+    for r in PLACES:
+        result = np.asarray(tide(r, MOON, bodies.GM_MOON))
+        np.testing.assert_allclose(result, gradient(raised, r), rtol=1e-6, atol=1e-8 * np.abs(result).max())
 
 
 def test_sunlight_is_the_visible_part_of_the_disc():
     """Counted on the sky: points of the Sun's disc outside the Earth's. The limb is not quite straight."""
-    u, v = np.meshgrid(np.linspace(-1, 1, 801), np.linspace(-1, 1, 801))
+    u, v = np.meshgrid(np.linspace(-1, 1, 401), np.linspace(-1, 1, 401))
     disc = np.hypot(u, v) < 1
     sun = np.array([1.496e8, 0.0, 0.0])
     # Behind the Earth, on a circle of 26,560 km, through the whole penumbra.
     angles = np.linspace(0.2355, 0.2495, 57)
-    result, expected = [], []
-    for angle in angles:
-        r = 26_560.0 * np.array([-np.cos(angle), np.sin(angle), 0.0])
-        result.append(float(bodies.sunlight(jnp.asarray(r), jnp.asarray(sun))))
+    places = 26_560.0 * np.stack([-np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    result, expected = np.asarray(jax.jit(jax.vmap(bodies.sunlight, (0, None)))(places, sun)), []
+    for r in places:
         to_sun, to_earth = sun - r, -r
         between = np.arccos(to_sun @ to_earth / np.linalg.norm(to_sun) / np.linalg.norm(to_earth))
         a, b = np.arcsin(bodies.SUN_RADIUS / np.linalg.norm(to_sun)), np.arcsin(geopotential.RADIUS / 26_560.0)
         seen = np.hypot(between + a * u, a * v) > b
         expected.append((disc & seen).sum() / disc.sum())
     assert result[0] == 0.0 and result[-1] == 1.0 and np.all(np.diff(result) >= 0)
-    assert np.abs(np.array(result) - expected).max() < 0.01
+    assert np.abs(result - expected).max() < 0.01
     assert float(bodies.sunlight(jnp.array([26_560.0, 0.0, 0.0]), jnp.asarray(sun))) == 1.0
     slopes = jax.vmap(jax.grad(lambda a: bodies.sunlight(26_560.0 * jnp.array([-jnp.cos(a), jnp.sin(a), 0.0]), sun)))
-    assert np.isfinite(slopes(jnp.asarray(angles))).all()
+    assert np.isfinite(jax.jit(slopes)(angles)).all()
 
 
 def test_axes_are_orthogonal_and_right_handed():
@@ -135,7 +140,7 @@ def test_earth_orientation_is_that_of_the_iers():
     arcsecond = np.pi / 180 / 3600
     assert result.x[0] / arcsecond == pytest.approx(0.051831, abs=1e-5)
     assert result.y[0] / arcsecond == pytest.approx(0.391315, abs=1e-5)
-    with pytest.raises(ValueError, match="Earth orientation is known from MJD"), pytest.warns(Warning, match="dubious"):
+    with pytest.raises(ValueError, match="MJD"), pytest.warns(Warning, match="dubious"):
         earth.orientation(np.array([orbits.gps_seconds(2150, 1, 1)]))
 
 

@@ -85,9 +85,9 @@ def test_log_density_of_errors():
 
 def test_a_search_that_starts_where_there_is_no_density_says_so():
     target = learning.Target(lambda z: (np.nan, np.zeros(2)), magnitudes.Prior(np.zeros(2), np.ones(2)))
-    with pytest.raises(ValueError, match="no density at the first magnitudes"):
+    with pytest.raises(ValueError, match="magnitudes"):
         target.mode()
-    with pytest.raises(ValueError, match="no finite curvature"):
+    with pytest.raises(ValueError, match="curvature"):
         learning.Target(lambda z: (0.0, np.full(2, np.nan)), target.prior).draws(np.zeros(2), 3)
 
 
@@ -196,22 +196,18 @@ def test_densities_of_positions_are_those_of_a_gaussian(freely):
     assert float(training.held_out(vector, data.regression, data.axes)) == pytest.approx(total, rel=1e-5)
 
 
-@pytest.mark.parametrize("slope", [training.slope_of_held_out, training.slope_of_log_likelihood])
-@pytest.mark.parametrize("logarithm", [400.0, np.inf, np.nan])
-def test_magnitudes_beyond_numbers_have_minus_infinity_and_zero_slopes(freely, slope, logarithm):
-    data, vector, _, _ = freely
-    value, result = slope(np.full_like(vector, logarithm), data.regression, data.axes)
-    assert value == -np.inf and (np.asarray(result) == 0.0).all()
-    value, result = slope(np.full_like(vector, -400.0), data.regression, data.axes)
-    assert np.isfinite(value) and np.isfinite(result).all()
-
-
-def test_a_matrix_without_a_root_has_no_density_and_zero_slopes(freely):
+@pytest.mark.slow
+@pytest.mark.parametrize("slope", [training.slope_of_log_likelihood, training.slope_of_held_out])
+def test_magnitudes_beyond_numbers_have_minus_infinity_and_zero_slopes(freely, slope):
+    """So has a matrix without a root."""
     data, vector, _, _ = freely
     wrong = data.regression._replace(noise=-data.noise)
-    for slope in (training.slope_of_held_out, training.slope_of_log_likelihood):
-        value, result = slope(vector, wrong, data.axes)
+    for point, regression in (*((np.full_like(vector, logarithm), data.regression) for logarithm in (
+            400.0, np.inf, np.nan)), (vector, wrong)):
+        value, result = slope(point, regression, data.axes)
         assert value == -np.inf and (np.asarray(result) == 0.0).all()
+    value, result = slope(np.full_like(vector, -400.0), data.regression, data.axes)
+    assert np.isfinite(value) and np.isfinite(result).all()
 
 
 @pytest.fixture(scope="module", params=["DYB", "RTN"])
