@@ -1,4 +1,4 @@
-"""Observation families in a Bayesian workflow: calibration of samplers with EP, and draws of the prior."""
+"""Observation families and model files: calibration of samplers with EP, and densities at draws of the prior."""
 
 import os
 from pathlib import Path
@@ -13,9 +13,11 @@ from jax.flatten_util import ravel_pytree
 from numpyro import handlers
 from numpyro.distributions import biject_to
 from numpyro.infer import NUTS, Predictive
+from numpyro.infer.util import log_density
 
 import lfm_ppl as lfm
 from lfm_ppl.inference.bind import bind
+from lfm_ppl.inference.handlers import settings
 from lfm_ppl.io import loading
 from lfm_ppl.results import calibration
 
@@ -98,7 +100,11 @@ def inflated(times, y=None):
 FAMILIES = {"Poisson": poisson, "Poisson, softplus": softplus_poisson, "negative binomial": negative_binomial,
             "Bernoulli": bernoulli, "binomial": binomial, "Student-t": student_t, "censored": censored,
             "zero-inflated": inflated}
-FILES = {"coal": {}, "epidemic": {}, "transcription": {"df": 4.0}, "ballistic": {"df": 4.0}}
+FILES = {"coal": {}, "epidemic": {}, "transcription": {"df": 4.0}, "ballistic": {"df": 4.0}, "ginzburg-landau": {},
+         "spring": {}, **{f"transcription {link}": {"link": link} for link in (
+             "softplus", "linear", "saturation", "repression", "exponential")}}
+# Explicit integration with the model's own 60 steps is unstable in the stiffest wells.
+MOST_FAILURES = {"ginzburg-landau": 0.05}
 
 
 def assert_uniform(result, bins):
@@ -107,19 +113,10 @@ def assert_uniform(result, bins):
     assert min(min(pair.values()) for pair in values.values()) > 0.001, values
 
 
-@pytest.mark.slow
 def test_random_walks_with_expectation_propagation_are_calibrated():
     """A small one: 24 data sets of 6 rows, and random walks, whose program is a fraction of that of NUTS."""
     result = calibration.calibrate(jax.random.key(4), counts, np.arange(6.0), lfm.RAM, data_sets=24, draws=15, thin=20,
                                   warmup=200)
-    assert_uniform(result, bins=4)
-
-
-def test_nuts_with_expectation_propagation_is_calibrated_on_few_counts():
-    """A small one of the next: 40 data sets of 6 rows, two parameters."""
-    result = calibration.calibrate(jax.random.key(3), counts, np.arange(6.0),
-                                  lambda model: NUTS(model, max_tree_depth=5), data_sets=40, draws=15, thin=3,
-                                  warmup=150)
     assert {"level", "scale", "log likelihood"} == set(result.ranks)
     assert_uniform(result, bins=4)
 
@@ -138,19 +135,20 @@ def test_nuts_with_expectation_propagation_is_calibrated(name, tmp_path):
 
 
 def densities(model, times, y, count, keywords=None, known=None, seed=0):
-    """Return values and gradients of the log density at draws of the prior, in one program, one after the other.
+    """Return draws of the prior, and the function from them to log densities and their gradients, in one program.
 
-    Side by side all of them wait for the one whose sites take longest, with several times the memory.
+    One after the other: side by side all of them wait for the one whose sites take longest, with several times the
+    memory.
     """
     keywords = keywords or {}
     bound = bind(model, times, y, **keywords).fix(known or {})
     prior = Predictive(handlers.block(model, hide=["y"]), num_samples=count)(jax.random.key(seed), times, y, **keywords)
     trace = handlers.trace(handlers.seed(model, 0)).get_trace(times, y, **keywords)
     draws = {name: biject_to(trace[name]["fn"].support).inv(prior[name]) for name in bound.sites}
-    z = jax.vmap(lambda one: ravel_pytree(one)[0])(draws)
+    z = jax.vmap(lambda draw: ravel_pytree(draw)[0])(draws)
     assert z.shape == (count, bound.size)
     run = jax.jit(lambda z: jax.lax.map(jax.value_and_grad(bound.log_density), z))
-    return map(np.asarray, run(z))
+    return np.asarray(z), lambda z: tuple(map(np.asarray, run(z)))
 
 
 def data(name, seed=0):
@@ -161,26 +159,60 @@ def data(name, seed=0):
     return y
 
 
-def assert_nearly_all_have_a_density(name, value, gradient):
+def of_file(name, count):
+    """Thirty rows of the model's own simulated data."""
+    file, options = loading.load(name.split()[0]), FILES[name]
+    simulated = file.simulate(1, **options)
+    return densities(file.model, simulated.times[:30], simulated.y[:30], count, file.keywords(simulated, options),
+                     file.anchors(simulated))
+
+
+def assert_nearly_all_have_a_density(name, z, run):
+    """A model may be far from the data: no NaN, and fewer than one in a hundred without converged sites."""
+    value, gradient = run(z)
     share = np.isneginf(value).mean()
     print(name, len(value), "share of -inf", share)
     assert not np.isnan(value).any() and np.isfinite(gradient).all()
-    assert share < 0.01
+    assert share < MOST_FAILURES.get(name, 0.01)
+    return value, gradient
 
 
 @pytest.mark.parametrize("name, count", [("Student-t", 50), *(pytest.param(name, 10_000, marks=pytest.mark.slow)
                                                               for name in FAMILIES)])
 def test_draws_of_the_prior_have_a_density_and_a_gradient(name, count):
-    """A model may be far from the data: no NaN, and fewer than one in a hundred without converged sites."""
     assert_nearly_all_have_a_density(name, *densities(FAMILIES[name], TIMES, data(name), count))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FILES)
-def test_draws_of_the_prior_of_a_file_have_a_density_and_a_gradient(name):
-    """Thirty rows of the model's own simulated data."""
-    file = loading.load(name)
-    simulated = file.simulate(1, **FILES[name])
-    times, y = simulated.times[:30], simulated.y[:30]
-    assert_nearly_all_have_a_density(name, *densities(file.model, times, y, 10_000,
-                                                      file.keywords(simulated, FILES[name]), file.anchors(simulated)))
+@pytest.mark.parametrize("name, count", [("spring", 100), *(pytest.param(name, 2_000, marks=pytest.mark.slow)
+                                                            for name in FILES)])
+def test_draws_of_the_prior_of_a_file_have_a_density_and_the_gradient_of_differences(name, count):
+    z, run = of_file(name, count)
+    value, gradient = assert_nearly_all_have_a_density(name, z, run)
+    if name == "ginzburg-landau":
+        return  # where another number of steps meets the tolerance, the density itself jumps by a little
+    size = z.shape[1]
+    chosen = np.flatnonzero(np.isfinite(value))[:count // (4 * size)][:8]
+    step = 1e-3 * np.array([1, -1, 2, -2])
+    points = (z[chosen, None, None] + step[:, None] * np.eye(size)[:, None, :]).reshape(-1, size)
+    padded = np.concatenate([points, np.repeat(z[:1], len(z) - len(points), axis=0)])
+    shifted = run(padded)[0][: len(points)].reshape(len(chosen), size, 4)
+    differences = (8 * (shifted[..., 0] - shifted[..., 1]) - (shifted[..., 2] - shifted[..., 3])) / 12e-3
+    scale = np.abs(gradient[chosen]).max(axis=1, keepdims=True)
+    np.testing.assert_array_less(np.abs(gradient[chosen] - differences) / scale, 1e-5)
+
+
+def test_shorter_steps_leave_no_failure():
+    """The double well fails where it is stiff, and there only."""
+    file = loading.load("ginzburg-landau")
+    data = file.simulate(seed=1)
+    draws = Predictive(handlers.block(file.model, hide=["y"]), num_samples=1000)(jax.random.key(7), data.times, data.y)
+    parameters = {name: draws[name] for name in file.parameters}
+    failed = {}
+    for steps in (60, 640):
+        finer = settings.approximate(file.model, steps=steps)
+        density = jax.jit(jax.vmap(lambda theta, m=finer: log_density(m, (data.times, data.y), {}, theta)[0]))
+        failed[steps] = np.isneginf(density(parameters))
+        # Only what fails is tried again
+        parameters = {name: value[failed[steps]] for name, value in parameters.items()}
+    assert failed[60].any()
+    assert not failed[640].any()

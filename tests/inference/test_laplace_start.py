@@ -52,10 +52,9 @@ def many():
     numpyro.sample("x", dist.Normal().expand([MAX_PARAMETERS + 1]).to_event(1))
 
 
-@pytest.mark.parametrize("model, reason", [(two_modes, "several modes"), (flat, "flat at its mode along x, y"),
-                                           (many, f"{MAX_PARAMETERS + 1} parameters")])
-def test_a_mode_that_does_not_describe_the_posterior_is_refused(model, reason):
-    with pytest.raises(UnusableModeError, match=reason):
+@pytest.mark.parametrize("model, name", [(two_modes, "mode"), (flat, "x, y"), (many, str(MAX_PARAMETERS + 1))])
+def test_a_mode_that_does_not_describe_the_posterior_is_refused(model, name):
+    with pytest.raises(UnusableModeError, match=name):
         laplace_approximation(bound(model), seed=0)
 
 

@@ -49,24 +49,13 @@ COUNTS = jnp.array([3, 7, 4, 6])
 A, B = 22.0, 5.0
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"jacobian": False},
-        {"forward_mode": True},
-        {"hessian": "finite-differences"},
-        {"model_kwargs": {"noise": 0.05}},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("options", [{}, {"jacobian": False}, {"forward_mode": True},
+                                     {"hessian": "finite-differences"}, {"model_kwargs": {"noise": 0.05}}], ids=str)
 def test_a_gaussian_posterior_is_found_exactly(options):
     mean, covariance, evidence = regression_posterior(**options.get("model_kwargs", {}))
     result = map_estimate(regression, DESIGN, DATA, restarts=2, **options)
-    assert result.converged
-    assert result.message == "converged"
+    assert result.converged and result.message == "converged" and result.unidentified == ()
     assert result.coordinates == ("level", "slope[0]", "slope[1]")
-    assert result.unidentified == ()
     np.testing.assert_allclose(result.mode, mean, rtol=1e-7)
     np.testing.assert_allclose(result.parameters["level"], mean[0], rtol=1e-7)
     np.testing.assert_allclose(result.parameters["slope"], mean[1:], rtol=1e-7)
@@ -91,26 +80,20 @@ def test_a_mode_and_its_covariance_start_a_chain():
 
 def test_the_mode_of_the_unconstrained_density_is_not_that_of_the_constrained_one():
     # Gamma(a, b): mode a / b of log rate, whose curvature is a; mode (a - 1) / b of the rate
+    # and, by Stirling, the Laplace evidence of the integral gamma(a) / b^a in either space
+    constant = -float(gammaln(COUNTS + 1.0).sum()) - float(gammaln(2.0))
     unconstrained = map_estimate(rate_model, COUNTS, restarts=2)
     assert unconstrained.parameters["rate"] == pytest.approx(A / B, rel=1e-7)
     assert unconstrained.covariance[0, 0] == pytest.approx(1 / A, rel=1e-7)
-
+    expected = A * math.log(A / B) - A + 0.5 * math.log(2 * math.pi / A)
+    assert unconstrained.log_evidence == pytest.approx(constant + expected, abs=1e-7)
     constrained = map_estimate(rate_model, COUNTS, restarts=2, jacobian=False)
     mode = (A - 1) / B
     assert constrained.parameters["rate"] == pytest.approx(mode, rel=1e-7)
     # variance of the rate is mode^2 / (a - 1); of its logarithm 1 / (a - 1)
     assert constrained.covariance[0, 0] == pytest.approx(1 / (A - 1), rel=1e-6)
-
-
-def test_evidence_is_laplace_in_the_chosen_space():
-    # log Gamma integral  gamma(a) / b^a  by Stirling, in log rate and in rate
-    constant = -float(gammaln(COUNTS + 1.0).sum()) - float(gammaln(2.0))
-    in_log = A * math.log(A / B) - A + 0.5 * math.log(2 * math.pi / A)
-    in_rate = (A - 1) * math.log((A - 1) / B) - (A - 1)
-    in_rate += 0.5 * math.log(2 * math.pi * (A - 1) / B**2)
-    for jacobian, expected in ((True, in_log), (False, in_rate)):
-        result = map_estimate(rate_model, COUNTS, restarts=1, jacobian=jacobian)
-        assert result.log_evidence == pytest.approx(constant + expected, abs=1e-7)
+    expected = (A - 1) * math.log(mode) - (A - 1) + 0.5 * math.log(2 * math.pi * (A - 1) / B**2)
+    assert constrained.log_evidence == pytest.approx(constant + expected, abs=1e-7)
 
 
 def test_draws_follow_the_laplace_approximation():
@@ -157,18 +140,9 @@ def test_the_best_of_several_restarts_is_taken():
     assert stuck.parameters["x"] == pytest.approx(-4 * 100 / 101, abs=1e-6)
     best = map_estimate(two_modes, init={"x": -5.0}, restarts=8)
     assert best.parameters["x"] == pytest.approx(4 * 100 / 101, abs=1e-6)
-    assert best.restart_log_densities.shape == (8,)
     assert best.restart_log_densities[0] == pytest.approx(stuck.log_density)
     assert best.restart_log_densities.max() == pytest.approx(best.log_density)
-    again = map_estimate(two_modes, init={"x": -5.0}, restarts=8)
-    assert np.array_equal(again.mode, best.mode)
-
-
-def test_starting_points():
-    given = {"slope": [0.3, 0.4]}  # level from its prior median
-    assert map_estimate(regression, DESIGN, DATA, init=given, restarts=1).converged
-    strategy = init_to_uniform(radius=0.5)
-    assert map_estimate(regression, DESIGN, DATA, init=strategy, restarts=1).converged
+    assert map_estimate(two_modes, init=init_to_uniform(radius=0.5), restarts=1).converged
 
 
 def partly_impossible():
@@ -191,7 +165,7 @@ def test_flat_directions_are_named_and_the_covariance_stays_definite():
         numpyro.sample("c", dist.Normal(1.0, 2.0))
         numpyro.sample("y", dist.Normal(total, 1.0), obs=y)
 
-    with pytest.warns(UserWarning, match="flat at its mode in a direction of a, b.*prior, or fix"):
+    with pytest.warns(UserWarning, match="a, b"):
         result = map_estimate(model, 3.0)
     assert result.unidentified == ("a", "b")
     assert result.parameters["a"] + result.parameters["b"] == pytest.approx(3.0)
@@ -224,30 +198,9 @@ def test_a_mode_at_infinity_is_reported():
         numpyro.sample("z", dist.Normal())
         numpyro.factor("slope", 0.1 * x)
 
-    with pytest.warns(UserWarning, match="did not converge.*more restarts"):
+    with pytest.warns(UserWarning, match="converge"):
         result = map_estimate(model, restarts=1, max_iterations=20)
-    assert not result.converged
-    assert result.message != "converged"
-
-
-def test_derivatives_that_do_not_exist_are_reported():
-    @jax.custom_jvp
-    def rough(x):
-        return x**2
-
-    @rough.defjvp
-    def rough_jvp(primals, tangents):
-        return rough(*primals), jnp.nan * tangents[0]
-
-    def model():
-        numpyro.factor("rough", -rough(numpyro.sample("x", dist.Normal())))
-
-    with pytest.warns(UserWarning, match="derivatives are not finite"):
-        result = map_estimate(model, restarts=1)
-    assert not result.converged
-    assert np.isnan(result.log_evidence)
-    with pytest.raises(ValueError, match="no Laplace approximation to draw from"):
-        result.sample(jax.random.key(0), 3)
+    assert not result.converged and result.message != "converged"
 
 
 def test_forward_mode_serves_loops_that_have_no_reverse_mode():
@@ -352,19 +305,12 @@ def impossible():
     numpyro.factor("never", jnp.where(x > 1e9, 0.0, -jnp.inf))
 
 
-@pytest.mark.parametrize(
-    ("model", "options", "message"),
-    [
-        (two_modes, {"hessian": "autodif"}, "unknown hessian 'autodif'. Did you mean 'autodiff'"),
-        (two_modes, {"restarts": 0}, "restarts must be at least 1"),
-        (two_modes, {"max_iterations": 0}, "max_iterations must be at least 1"),
-        (two_modes, {"init": {"y": 1.0}}, "unknown site in init 'y'.*Known: x"),
-        (two_modes, {"init": {"x": [1.0, 2.0]}}, r"init\['x'\] must be of shape \(\), got"),
-        (partly_impossible, {"init": {"x": -1.0}}, "density is zero or not finite at init="),
-        (impossible, {}, "no point of finite density in 4 x 20 draws.*Give a starting point"),
-        (discrete, {}, "map_estimate needs continuous parameters.*'class'"),
-    ],
-)
-def test_bad_input_is_named(model, options, message):
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize(("model", "options", "name"), [
+    (two_modes, {"hessian": "autodif"}, "'autodif'"), (two_modes, {"restarts": 0}, "restarts"),
+    (two_modes, {"max_iterations": 0}, "max_iterations"), (two_modes, {"init": {"y": 1.0}}, "'y'"),
+    (two_modes, {"init": {"x": [1.0, 2.0]}}, "'x'"), (partly_impossible, {"init": {"x": -1.0}}, "init="),
+    (impossible, {}, "finite density"), (discrete, {}, "'class'"),
+])
+def test_bad_input_is_named(model, options, name):
+    with pytest.raises(ValueError, match=name):
         map_estimate(model, **options)

@@ -9,7 +9,6 @@ from numpyro.infer import Predictive
 from numpyro.infer.util import log_density
 
 import lfm_ppl as lfm
-from lfm_ppl.utils.batching import mapped
 
 TIMES = np.array([0.0, 0.5, 1.5, 2.0, 3.5])
 RATES = np.array([0.4, 0.9, 1.6])
@@ -27,12 +26,12 @@ def build(rate, lengthscale, softness=1.0):
 
 
 def one(rate, lengthscale, times, y):
-    return lfm.MarginalLikelihood(build(rate, lengthscale), times, steps=4).log_prob_per_observation(y)
+    return lfm.MarginalLikelihood(build(rate, lengthscale), times, steps=1, iterations=0).log_prob_per_observation(y)
 
 
 def panel(rates, lengthscale, times=TIMES):
     """The lengthscale is shared: the builder closes over it."""
-    return lfm.panel(lambda p: build(p["rate"], lengthscale), {"rate": rates}, times, steps=4)
+    return lfm.panel(lambda p: build(p["rate"], lengthscale), {"rate": rates}, times, steps=1, iterations=0)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +66,7 @@ def together():
 
 
 def test_panel_equals_a_loop(y, looped):
-    each, _ = looped
+    results, _ = looped
 
     @jax.jit
     def evaluate(rates, lengthscale, y):
@@ -77,71 +76,51 @@ def test_panel_equals_a_loop(y, looped):
 
     values, observations, (by_rate, by_lengthscale) = evaluate(RATES, LENGTHSCALE, y)
     assert values.shape == (3,)
-    np.testing.assert_allclose(observations, np.stack([e[0] for e in each]), rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(values, [e[0].sum() for e in each], rtol=1e-10)
-    np.testing.assert_allclose(by_rate, [e[1][0] for e in each], rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(by_lengthscale, sum(e[1][1] for e in each), rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(observations, np.stack([e[0] for e in results]), rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(values, [e[0].sum() for e in results], rtol=1e-10)
+    np.testing.assert_allclose(by_rate, [e[1][0] for e in results], rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(by_lengthscale, sum(e[1][1] for e in results), rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("own_times", [False, True], ids=["shared times", "own times"])
-def test_many_series_go_one_after_another_on_a_cpu(y, monkeypatch, own_times):
-    """To the same values and gradients as side by side."""
+def test_many_series_go_one_after_another_on_a_cpu(y, monkeypatch):
+    """To the same values and gradients as side by side, with times of their own."""
     count = 9
     index = np.arange(count) % 3
     rates, several = RATES[index] + 0.01 * np.arange(count), y[index]
-    times = TIMES * (1.0 + 0.1 * np.arange(count)[:, None]) if own_times else TIMES
+    times = TIMES * (1.0 + 0.1 * np.arange(count)[:, None])
 
     def evaluate():
-        total = lambda rates, lengthscale: panel(rates, lengthscale, times).log_prob(several).sum()  # noqa: E731
-        return jax.jit(jax.value_and_grad(total, argnums=(0, 1)))
+        return jax.jit(jax.value_and_grad(lambda rates, lengthscale: panel(rates, lengthscale, times).log_prob(
+            several).sum(), argnums=(0, 1)))
+
+    def count_loops():
+        return str(jax.make_jaxpr(evaluate())(rates, LENGTHSCALE)).count(f"length={count}")
 
     monkeypatch.setattr("lfm_ppl.utils.batching.on_cpu", lambda: True)
-    loops = lambda: str(jax.make_jaxpr(evaluate())(rates, LENGTHSCALE)).count(f"length={count}")  # noqa: E731
-    assert loops()
-    one_by_one = evaluate()(rates, LENGTHSCALE)
+    assert count_loops()
+    in_sequence = evaluate()(rates, LENGTHSCALE)
     monkeypatch.setattr("lfm_ppl.utils.batching.on_cpu", lambda: False)
-    assert not loops()
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12), one_by_one,
+    assert not count_loops()
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12), in_sequence,
                  evaluate()(rates, LENGTHSCALE))
 
 
-def test_batches_of_results_without_entries(monkeypatch):
-    monkeypatch.setattr("lfm_ppl.utils.batching.on_cpu", lambda: True)
-    x = jnp.arange(24.0).reshape(12, 2)
-    total, empty = mapped(lambda row: (row.sum(), row[:0]), x, batch_size=4)
-    np.testing.assert_array_equal(total, x.sum(1))
-    assert empty.shape == (12, 0)
-
-
-def test_series_with_times_of_their_own(y, looped, together):
+def test_series_with_times_of_their_own_padded_or_all_missing(y, looped, together):
     _, loop = looped
-    times = np.stack([TIMES, 1.7 * TIMES, TIMES**1.2 + 1.0])
-    values, (by_rate, _) = together(RATES, LENGTHSCALE, times, y)
+    short = 3
+    padded = np.concatenate([TIMES[:short], np.repeat(TIMES[short - 1], 2)])
+    times, ragged = np.stack([TIMES, 1.7 * TIMES, padded]), y.copy()
+    ragged[2, short:] = np.nan
+    values, (by_rate, _) = together(RATES, LENGTHSCALE, times, ragged)
     for index in range(3):
-        density, (slope, _) = loop(RATES[index], LENGTHSCALE, times[index], y[index])
+        density, (slope, _) = loop(RATES[index], LENGTHSCALE, times[index], ragged[index])
         np.testing.assert_allclose(values[index], density.sum(), rtol=1e-10)
         np.testing.assert_allclose(by_rate[index], slope, rtol=1e-10, atol=1e-10)
-
-
-def test_ragged_series_are_padded(y, together):
-    short = 3
-    times = np.stack([TIMES, TIMES, np.concatenate([TIMES[:short], np.repeat(TIMES[short - 1], 2)])])
-    ragged = y.copy()
-    ragged[2, short:] = np.nan
-    values, gradients = together(RATES, LENGTHSCALE, times, ragged)
-    alone = jax.jit(one)(RATES[2], LENGTHSCALE, TIMES[:short], y[2, :short])
-    np.testing.assert_allclose(values[2], alone.sum(), rtol=1e-10)
-    assert all(np.all(np.isfinite(gradient)) for gradient in gradients)
-
-
-def test_an_all_missing_series_contributes_zero(y, together):
-    missing = y.copy()
-    missing[1] = np.nan
-    times = np.broadcast_to(TIMES, (3, len(TIMES)))
-    values, (by_rate, _) = together(RATES, LENGTHSCALE, times, missing)
-    assert values[1] == 0.0
-    assert by_rate[1] == 0.0
-    assert np.all(values[[0, 2]] != 0.0)
+    alone = lfm.filter(build(RATES[2], LENGTHSCALE), TIMES[:short], y[2, :short], steps=1)
+    np.testing.assert_allclose(values[2], alone.log_likelihood.sum(), rtol=1e-10)
+    ragged[1] = np.nan
+    values, (by_rate, _) = together(RATES, LENGTHSCALE, times, ragged)
+    assert values[1] == by_rate[1] == 0.0 and np.all(values[[0, 2]] != 0.0)
 
 
 def test_one_impossible_series_leaves_the_others_alone(y, together):
@@ -156,7 +135,7 @@ def test_one_impossible_series_leaves_the_others_alone(y, together):
 
 
 def test_in_a_plate(y, looped):
-    each, _ = looped
+    results, _ = looped
 
     def model(times, y=None, mask=None):
         lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.0, 0.3))
@@ -168,7 +147,7 @@ def test_in_a_plate(y, looped):
     values = {"rate": jnp.asarray(RATES), "lengthscale": jnp.asarray(LENGTHSCALE)}
     score = jax.jit(lambda mask: log_density(model, (TIMES, y, mask), {}, values)[0])
     prior = dist.LogNormal(0.0, 0.5).log_prob(RATES).sum() + dist.LogNormal(0.0, 0.3).log_prob(LENGTHSCALE)
-    series = np.array([e[0].sum() for e in each])
+    series = np.array([e[0].sum() for e in results])
     for mask in ([True, True, True], [True, False, True]):
         np.testing.assert_allclose(score(jnp.array(mask)), prior + series[mask].sum(), rtol=1e-10)
     draws = Predictive(model, num_samples=2)(jax.random.key(0), TIMES, mask=True)
@@ -177,22 +156,15 @@ def test_in_a_plate(y, looped):
 
 
 def test_one_series_in_a_plate_is_an_error(y):
-    def model(times, y=None):
+    def model(times, y=None, lengthscale=LENGTHSCALE):
         with numpyro.plate("series", 3):
-            numpyro.sample("y", lfm.MarginalLikelihood(build(0.5, LENGTHSCALE), times), obs=y)
+            numpyro.sample("y", lfm.MarginalLikelihood(build(0.5, lengthscale), times), obs=y)
 
-    with pytest.raises(ValueError, match=r"one series.*batch shape \(3,\) of a numpyro.plate.*take lfm.panel"):
-        handlers.trace(handlers.seed(model, 0)).get_trace(TIMES, y)
+    for lengthscale in (LENGTHSCALE, LENGTHSCALE * jnp.ones(3)):
+        with pytest.raises(ValueError, match="lfm.panel"):
+            handlers.trace(handlers.seed(model, 0)).get_trace(TIMES, y, lengthscale)
     single = lfm.MarginalLikelihood(build(0.5, LENGTHSCALE), TIMES)
     assert single.expand(()) is single
-
-    def vectors(times):
-        with numpyro.plate("series", 3):
-            lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.0, 0.5))
-            numpyro.sample("y", lfm.MarginalLikelihood(build(0.5, lengthscale), times))
-
-    with pytest.raises(ValueError, match=r"lengthscale must be one number.*numpyro.plate, take lfm.panel"):
-        handlers.trace(handlers.seed(vectors, 0)).get_trace(TIMES)
 
 
 def test_samples(y):
@@ -211,30 +183,23 @@ def test_samples(y):
 
 
 def test_rebuilt_as_a_pytree(y, looped):
-    each, _ = looped
+    results, _ = looped
     leaves, tree = jax.tree.flatten(panel(jnp.asarray(RATES), LENGTHSCALE, jnp.asarray(TIMES)))
     again = jax.jit(lambda leaves, y: tree.unflatten(leaves).log_prob(y))(leaves, y)
-    np.testing.assert_allclose(again, [e[0].sum() for e in each], rtol=1e-10)
+    np.testing.assert_allclose(again, [e[0].sum() for e in results], rtol=1e-10)
 
 
-def test_errors(y):
-    with pytest.raises(ValueError, match="parameters must hold at least one array"):
-        lfm.panel(lambda p: build(1.0, 1.0), {}, TIMES)
-    with pytest.raises(ValueError, match=r"same leading axis.*\(3,\), \(2,\).*close over it in build"):
-        lfm.panel(lambda p: build(p[0], p[1]), (RATES, RATES[:2]), TIMES)
-    with pytest.raises(ValueError, match=r"same leading axis.*\(\)"):
-        lfm.panel(lambda p: build(p["rate"], p["l"]), {"rate": RATES, "l": 1.0}, TIMES)
-    with pytest.raises(ValueError, match="times has 2 rows for 3 series"):
-        panel(RATES, LENGTHSCALE, np.stack([TIMES, TIMES]))
-    with pytest.raises(ValueError, match=r"\(3, 5, 1\) \(series, times, outputs\), got \(3, 4, 1\); pad .* with NaN"):
-        panel(RATES, LENGTHSCALE).log_prob(y[:, :4])
-    with pytest.raises(ValueError, match="y has infinite entries"):
-        panel(RATES, LENGTHSCALE).log_prob(np.where(np.isnan(y), np.inf, y))
-    with pytest.raises(ValueError, match="times"):
-        panel(RATES, LENGTHSCALE, TIMES[::-1])
-    with pytest.raises(ValueError, match="max_step is not supported in a panel whose series have different times"):
-        lfm.panel(lambda p: build(p, 1.0), RATES, np.stack([TIMES, TIMES, TIMES]), max_step=0.1)
-    with pytest.raises(TypeError, match="rule must be"):
-        lfm.panel(lambda p: build(p, 1.0), RATES, TIMES, rule="cubature")
-    with pytest.raises(ValueError, match="series 1: times must not go back: row 1"):
-        panel(RATES, LENGTHSCALE, np.stack([TIMES, TIMES[::-1], TIMES]))
+def test_wrong_arguments_are_named(y):
+    three = np.stack([TIMES] * 3)
+    for compute, error, name in (
+            (lambda: lfm.panel(lambda p: build(1.0, 1.0), {}, TIMES), ValueError, "parameters"),
+            (lambda: lfm.panel(lambda p: build(p[0], p[1]), (RATES, RATES[:2]), TIMES), ValueError, r"\(3,\), \(2,\)"),
+            (lambda: panel(RATES, LENGTHSCALE, three[:2]), ValueError, "times has 2 rows"),
+            (lambda: panel(RATES, LENGTHSCALE).log_prob(y[:, :4]), ValueError, r"\(3, 5, 1\)"),
+            (lambda: panel(RATES, LENGTHSCALE).log_prob(np.full(y.shape, np.inf)), ValueError, "y has infinite"),
+            (lambda: panel(RATES, LENGTHSCALE, TIMES[::-1]), ValueError, "times"),
+            (lambda: lfm.panel(lambda p: build(p, 1.0), RATES, three, max_step=0.1), ValueError, "max_step"),
+            (lambda: lfm.panel(lambda p: build(p, 1.0), RATES, TIMES, rule="cubature"), TypeError, "rule"),
+            (lambda: panel(RATES, LENGTHSCALE, np.stack([TIMES, TIMES[::-1], TIMES])), ValueError, "series 1")):
+        with pytest.raises(error, match=name):
+            compute()

@@ -1,32 +1,40 @@
-"""Chains on devices of their own, in a process that has two."""
+"""Chains of `lfm.fit` on devices of their own, in a process that has two."""
 
 from processes import on_two_devices
 
 CODE = """
 import sys
-sys.path += ["tests", "tests/inference", "."]
+sys.path += ["tests", "."]
 import jax
 jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
 import numpy as np
-import linear_motif as motif
+import numpyro
+import numpyro.distributions as dist
+import systems
 import lfm_ppl as lfm
 from lfm_ppl.inference import sampling
-from tests.inference.test_bound_model import compilations
+from compiled_programs import compilations
+
+def model(times, y=None):
+    decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+    system = systems.motif(systems.identity, decay=decay, genes=1, order=0)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
 assert jax.local_device_count() == 2
 sampling.BLOCK_S = 0.02
-draws = {}
+y = jax.device_put(np.array([[0.4], [0.8], [0.9]]), jax.devices()[0])  # the other chain must find them, too
+draws = []
 for method in ("sequential", "parallel"):
     with compilations() as compiled:
-        y = jax.device_put(motif.data(), jax.devices()[0])  # the other chain must find them, too
-        found = lfm.fit(motif.model, motif.TIMES, y, sampler="ram", chains=2, warmup=400, samples=400,
-                        thin=1, trajectory_draws=0, progress=False, chain_method=method,
-                        sampler_options={"initial_covariance": 0.1 * np.eye(4)})
-    draws[method] = np.asarray(lfm.results.arviz_data.group(found, "posterior")["decay"])
+        result = lfm.fit(model, np.arange(3.0), y, sampler="ram", chains=2, warmup=400, samples=400, thin=1,
+                         trajectory_draws=0, progress=False, chain_method=method,
+                         sampler_options={"initial_covariance": 0.1 * np.eye(1)})
+    draws.append(np.asarray(lfm.results.arviz_data.group(result, "posterior")["decay"]))
 blocks = [name for name in compiled if "jit(advance_on_device)" in name]
 assert len(blocks) == 1, blocks
-np.testing.assert_allclose(draws["parallel"], draws["sequential"], rtol=1e-6)
-assert np.std(draws["parallel"], axis=1).min() > 0
+np.testing.assert_allclose(*draws, rtol=1e-6)
+assert np.std(draws, axis=-1).min() > 0
 print("same")
 """
 

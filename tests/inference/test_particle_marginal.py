@@ -64,20 +64,17 @@ def assert_posterior(log_rate, mean, sd):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("delayed", [False, True], ids=["plain", "delayed"])
-def test_it_reproduces_the_exact_posterior_of_a_linear_model(delayed):
+def test_the_estimate_is_carried_along_and_delayed_acceptance_spares_estimates():
     """Twenty particles give a noisy likelihood; the posterior is the Kalman filter's all the same."""
-    kernel = lfm.ParticleMarginalRAM(relaxing, particles=20, delayed=delayed)
+    kernel = lfm.ParticleMarginalRAM(relaxing, particles=20, delayed=True)
     mcmc = MCMC(kernel, num_warmup=500, num_samples=4000, num_chains=8, chain_method="vectorized", progress_bar=False)
     mcmc.run(jax.random.key(0), TIMES, Y, extra_fields=("potential_energy", "accepted", "estimated"))
-    log_rate = np.log(mcmc.get_samples(group_by_chain=True)["rate"])
-    assert_posterior(log_rate, *exact_posterior())
+    assert_posterior(np.log(mcmc.get_samples(group_by_chain=True)["rate"]), *exact_posterior())
     extra = mcmc.get_extra_fields(group_by_chain=True)
-    # The estimate is carried along: it changes exactly where a proposal is accepted.
+    # The estimate changes exactly where a proposal is accepted.
     changed = np.diff(extra["potential_energy"], axis=1) != 0
     assert np.array_equal(changed, np.asarray(extra["accepted"])[:, 1:])
-    reached = np.asarray(extra["estimated"])
-    assert reached.all() if not delayed else 0.2 < reached.mean() < 0.8
+    assert 0.2 < np.asarray(extra["estimated"]).mean() < 0.8
 
 
 @pytest.mark.parametrize("surrogate", [None, lambda z: 0.5 * ((z - 0.8) / 1.5) ** 2], ids=["plain", "delayed"])
@@ -110,19 +107,17 @@ def test_the_number_of_particles_is_chosen_for_an_sd_of_one():
     run = jax.jit(jax.vmap(lambda key: potential(z, key, tuned.particles)))
     sd = float(run(jax.random.split(jax.random.key(2), 1000)).std())
     assert 0.6 < sd < 1.5 and abs(tuned.sd - sd) < 0.4
-    more = potential.tune(z, jax.random.key(1), target_sd=0.3)
-    assert more.particles > 5 * tuned.particles
 
 
 def test_precise_observations_that_no_particle_meets_are_an_error(monkeypatch):
-    monkeypatch.setattr(particle_likelihood, "_MOST", 2000)
+    monkeypatch.setattr(particle_likelihood, "_MOST", 200)
 
     def impossible(times, y=None):
         rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))
         numpyro.sample("y", lfm.MarginalLikelihood(build(rate, noise=1e-20), times), obs=y)
 
     potential = ParticlePotential(bind(impossible, TIMES, Y), ParticleSettings(1))
-    with pytest.raises(ValueError, match="out of reach"):
+    with pytest.raises(ValueError, match="particle"):
         potential.tune(jnp.array([-0.5]), jax.random.key(1))
 
 
@@ -158,33 +153,6 @@ def test_fit_samples_and_reports_the_particles():
 
 
 @pytest.mark.slow
-def test_data_may_be_arguments_of_a_compiled_program():
-    """One kernel, other data: with ``jit_model_args`` the chain follows the data of each run."""
-    mcmc = MCMC(lfm.ParticleMarginalRAM(relaxing, particles=50), num_warmup=200, num_samples=600, num_chains=4,
-                chain_method="vectorized", progress_bar=False, jit_model_args=True)
-    result = []
-    for y in (Y, np.sign(Y)):
-        mcmc.run(jax.random.key(0), TIMES, y)
-        result.append(np.log(mcmc.get_samples(group_by_chain=True)["rate"]))
-    mean, sd = exact_posterior()
-    assert abs(result[0].mean() - mean) < 5.0 * sd / np.sqrt(effective(result[0]))
-    assert abs(result[1].mean() - result[0].mean()) > 0.3 * sd
-
-
-@pytest.mark.parametrize("wrap", [lambda d: d.mask(jnp.array(True)), lambda d: d.expand((1,)).to_event(1)],
-                         ids=["mask", "expand"])
-def test_a_likelihood_that_cannot_be_replaced_is_an_error(wrap):
-    def wrapped(times, y=None):
-        rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))
-        shape = np.shape(y) if np.ndim(y) == 2 else None
-        numpyro.sample("y", wrap(lfm.MarginalLikelihood(build(rate), times)), obs=y[None] if shape is None else y)
-
-    y = Y if wrap(dist.Normal(0.0, 1.0)).event_shape == () else Y[None]
-    with pytest.raises(ValueError, match="cannot replace"):
-        lfm.ParticleMarginalRAM(wrapped, particles=5).init(jax.random.key(0), 10, None, (TIMES, y), {})
-
-
-@pytest.mark.slow
 def test_trajectories_agree_with_the_exact_smoother_wherever_they_are_wanted():
     """Paths at single parameter values; a crowd of forecast times changes nothing elsewhere."""
     at = np.array([0.3, 1.0, 3.5])
@@ -198,31 +166,34 @@ def test_trajectories_agree_with_the_exact_smoother_wherever_they_are_wanted():
         assert np.allclose(result.std(axis=0), sd, rtol=0.15)
 
 
-@pytest.mark.parametrize("options, error, message", [
-    ({"particles": 5, "delayed": "no"}, TypeError, "delayed must be True or False"),
-    ({"particles": 0}, ValueError, "particles must be at least 1"),
-    ({"particle_steps": 0}, ValueError, "particle_steps must be at least 1"),
-    ({"particles": 5, "scheme": "milstien"}, ValueError, "'milstein'"),
-    ({"particles": 5, "target_accept_prob": 1.5}, ValueError, "between 0 and 1"),
-])
-def test_errors(options, error, message):
-    with pytest.raises(error, match=message):
-        kernel = lfm.ParticleMarginalRAM(relaxing, **options)
-        kernel.init(jax.random.key(0), 10, None, (TIMES, Y), {})
-
-
-def test_a_model_without_the_likelihood_is_named():
-    def plain(times, y=None):
-        numpyro.sample("y", dist.Normal(numpyro.sample("level", dist.Normal()), 1.0), obs=y)
-
-    with pytest.raises(ValueError, match="exactly one site"):
-        lfm.ParticleMarginalRAM(plain, particles=5).init(jax.random.key(0), 10, None, (TIMES, np.zeros(6)), {})
-
-
-def test_noise_without_a_density_is_named():
-    def exactly(times, y=None):
+@pytest.mark.parametrize("wrap", [lambda d: d.mask(jnp.array(True)), lambda d: d.expand((1,)).to_event(1)],
+                         ids=["mask", "expand"])
+def test_a_likelihood_that_cannot_be_replaced_is_an_error(wrap):
+    def wrapped(times, y=None):
         rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))
-        numpyro.sample("y", lfm.MarginalLikelihood(build(rate, noise=0.0), times), obs=y)
+        numpyro.sample("y", wrap(lfm.MarginalLikelihood(build(rate), times)), obs=y)
 
-    with pytest.raises(ValueError, match="'y0' is zero"):
-        lfm.ParticleMarginalRAM(exactly, particles=5).init(jax.random.key(0), 10, None, (TIMES, Y), {})
+    y = Y if wrap(dist.Normal(0.0, 1.0)).event_shape == () else Y[None]
+    with pytest.raises(ValueError, match="lfm.MarginalLikelihood"):
+        lfm.ParticleMarginalRAM(wrapped, particles=5).init(jax.random.key(0), 10, None, (TIMES, y), {})
+
+
+def plain(times, y=None):
+    numpyro.sample("y", dist.Normal(numpyro.sample("level", dist.Normal()), 1.0), obs=y)
+
+
+def exactly(times, y=None):
+    rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))
+    numpyro.sample("y", lfm.MarginalLikelihood(build(rate, noise=0.0), times), obs=y)
+
+
+@pytest.mark.parametrize(("model", "options", "error", "name"), [
+    (relaxing, {"delayed": "no"}, TypeError, "delayed"), (relaxing, {"particles": 0}, ValueError, "particles"),
+    (relaxing, {"particle_steps": 0}, ValueError, "particle_steps"),
+    (relaxing, {"scheme": "milstien"}, ValueError, "'milstien'"), (plain, {}, ValueError, "site"),
+    (exactly, {}, ValueError, "'y0'"),
+])
+def test_wrong_options_and_models_are_named(model, options, error, name):
+    with pytest.raises(error, match=name):
+        kernel = lfm.ParticleMarginalRAM(model, **{"particles": 5, **options})
+        kernel.init(jax.random.key(0), 10, None, (TIMES, Y if model is not plain else np.zeros(6)), {})

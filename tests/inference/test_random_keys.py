@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 
 from lfm_ppl.inference.random_keys import split_keys
-from tests.inference.test_bound_model import compilations
+from tests.compiled_programs import compilations
 
 
 @pytest.mark.parametrize("kind", ["threefry2x32", "rbg"])
 @pytest.mark.parametrize("partitionable", [True, False])
-@pytest.mark.parametrize("count", [0, 1, 4, 64, 65, 300, np.int64(5)])
-def test_keys_are_those_of_jax(kind, partitionable, count):
+def test_keys_are_those_of_jax(kind, partitionable):
     with jax.threefry_partitionable(partitionable):
         key = jax.random.key(7, impl=kind)
-        assert (split_keys(key, count)(slice(None)) == jax.random.split(key, count)).all()
+        for count in (0, 1, 64, 65, np.int64(5)):
+            assert (split_keys(key, count)(slice(None)) == jax.random.split(key, count)).all()
 
 
 def test_numbers_of_keys_share_a_program():

@@ -1,4 +1,4 @@
-"""Every shipped model converges on its own data with the default settings."""
+"""Every shipped model converges on its own data with the default settings, and some by a random walk."""
 
 import warnings
 
@@ -7,30 +7,26 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.io import loading
-from lfm_ppl.results.arviz_data import group, summary
+from lfm_ppl.results.arviz_data import group, groups, summary
 
-MODELS = sorted(loading.available())
+RANDOM_WALKS = [(name, {"sampler": "ram", "warmup": 1000, "samples": 1000})
+                for name in ("ginzburg-landau", "transcription", "spring")]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", MODELS)
-def test_default_run_converges_and_covers_the_truth(name):
+@pytest.mark.parametrize(("name", "options"), [*((name, {}) for name in sorted(loading.available())), *RANDOM_WALKS])
+def test_chains_converge_and_cover_the_truth(name, options):
     file = loading.load(name)
     data = file.simulate()
     with warnings.catch_warnings():
         warnings.simplefilter("error", lfm.ConvergenceWarning)
-        result = lfm.fit(
-            file.model,
-            data.times,
-            data.y,
-            model_kwargs=file.keywords(data, {}),
-            truth=data.truth,
-            progress=False,
-        )
+        result = lfm.fit(file.model, data.times, data.y, model_kwargs=file.keywords(data, {}), truth=data.truth,
+                         progress=False, **options)
     table = summary(result)
-    assert table["r_hat"].max() <= 1.01
-    assert table["ess_bulk"].min() >= 400
-    assert float(group(result, "sample_stats")["diverging"].mean()) < 0.005
+    assert table["r_hat"].max() <= 1.01 and table["ess_bulk"].min() >= 400
+    assert options or float(group(result, "sample_stats")["diverging"].mean()) < 0.005
+    for name in {"log_likelihood", "posterior_predictive", "trajectories"} & set(groups(result)):
+        assert all(np.isfinite(variable).all() for variable in group(result, name).data_vars.values()), name
     posterior, truth = group(result, "posterior"), group(result, "truth")
     ranks = []
     for parameter in file.parameters:

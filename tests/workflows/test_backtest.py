@@ -9,8 +9,8 @@ from scipy import stats
 
 import lfm_ppl as lfm
 from lfm_ppl.results import scoring
+from tests.compiled_programs import compilations
 from tests.inference import linear_motif as motif
-from tests.inference.test_bound_model import compilations
 
 NEAR = 1e-7
 TIMES = np.array([0.0, 0.4, 1.0, 1.7, 2.5, 3.2, 4.0, 4.6])
@@ -51,18 +51,13 @@ def test_forecasts_are_those_of_the_data_up_to_the_origin(linear):
     assert (wins[["rmse", "crps", "log_score"]] <= 3).all(axis=None)
 
 
-def test_data_with_their_names_are_one_argument(linear):
-    data_set = lfm.Data(TIMES, data(), ("left", "right"))
-    again = lfm.backtest(motif.model, data_set, horizon=2, every=1, first=4, model_kwargs={"spread": NEAR})
-    assert again.scores["output"].values.tolist() == ["left", "right"]
-    np.testing.assert_array_equal(again.scores["crps"], linear.scores["crps"])
-
-
-def test_further_origins_compile_nothing(linear):
+def test_further_origins_compile_nothing_and_outputs_have_the_names_of_the_data(linear):
     """Every fit has the shape of the whole data."""
+    data_set = lfm.Data(TIMES, data() + 0.1, ("left", "right"))
     with compilations() as compiled:
-        lfm.backtest(motif.model, TIMES, data() + 0.1, horizon=1, every=2, first=3, model_kwargs={"spread": NEAR})
+        result = lfm.backtest(motif.model, data_set, horizon=1, every=2, first=3, model_kwargs={"spread": NEAR})
     assert compiled == []
+    assert result.scores["output"].values.tolist() == ["left", "right"]
 
 
 def well(times, y=None):
@@ -102,17 +97,10 @@ def test_the_reference_is_the_last_season_with_the_spread_of_its_changes():
             assert np.isnan(naive["crps"][lead - 1, 0])  # a single change tells no spread
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"horizon": 8}, "there is no origin"), ({"horizon": 0}, "horizon"), ({"first": 2}, "at least 3"),
-    ({"season": 0}, "season"), ({"every": 0}, "every"),
-])
-def test_what_cannot_be_rolled(change, message):
-    with pytest.raises(ValueError, match=message):
-        lfm.backtest(motif.model, TIMES, data(), **{"horizon": 1, **change})
-
-
-def test_replicates_and_panels_are_refused():
-    with pytest.raises(ValueError, match="rows 1 and 2 have the same time 1"):
-        lfm.backtest(motif.model, np.array([0.0, 1.0, 1.0, 2.0]), np.zeros((4, 2)), horizon=1)
-    with pytest.raises(ValueError, match="one series"):
-        lfm.backtest(motif.model, TIMES, np.zeros((2, 8, 2)), horizon=1)
+@pytest.mark.parametrize(("change", "name"), [
+    ({"horizon": 8}, "origin"), ({"horizon": 0}, "horizon"), ({"first": 2}, "at least 3"), ({"season": 0}, "season"),
+    ({"every": 0}, "every"), ({"times": np.array([0.0, 1.0, 1.0, *TIMES[3:]])}, "rows 1 and 2"),
+    ({"y": np.zeros((2, 8, 2))}, "one series")])
+def test_wrong_arguments_are_named(change, name):
+    with pytest.raises(ValueError, match=name):
+        lfm.backtest(motif.model, **{"times": TIMES, "y": data(), "horizon": 1, **change})
