@@ -4,7 +4,6 @@ import functools
 import json
 import os
 import random
-import re
 import shutil
 import signal
 import subprocess
@@ -13,24 +12,22 @@ import time
 import warnings
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
-import systems
 import xarray as xr
 
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.handlers.settings import approximate
-from lfm_ppl.inference.posterior import scores
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.results import arviz_data, run_record
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
-from lfm_ppl.utils.interruption import interruptible
-from lfm_ppl.utils.progress import Progress, waiting
+from lfm_ppl.utils.progress import Progress
 from tests.processes import ROOT
 
 TIMES = np.arange(4.0)
@@ -39,10 +36,12 @@ SIZES = {"chains": 2, "warmup": 8, "samples": 6, "trajectory_draws": 4, "at": [0
 OPTIONS = {"pmmh": {"particles": 10}}
 
 
-def well(times, y=None, width=0.3):
-    """A double well whose noise is unknown."""
+def relaxation(times, y=None, width=0.3):
+    """Linear, so that little is compiled; its process noise is unknown."""
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, width))
-    system = systems.double_well(dispersion=noise, noise=0.1)
+    system = lfm.LatentForceModel(
+        lambda x, u, t: -x, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        lfm.Gaussian(jnp.array([0.5]), jnp.array([[0.2]])), process_noise=noise * jnp.eye(1))
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1), obs=y)
 
 
@@ -50,7 +49,7 @@ def fit(sampler, **changes):
     settings = {"sampler_options": OPTIONS.get(sampler), **SIZES, **changes}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return lfm.fit(settings.pop("model", well), settings.pop("times", TIMES), settings.pop("y", Y),
+        return lfm.fit(settings.pop("model", relaxation), settings.pop("times", TIMES), settings.pop("y", Y),
                        sampler=sampler, progress=False, **settings)
 
 
@@ -98,36 +97,30 @@ def whole():
     return functools.cache(fit)
 
 
-@pytest.mark.parametrize("sampler", ["nuts", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ram", "pmmh"))])
+@pytest.mark.parametrize("sampler", ["nuts", "ram", "pmmh"])
 def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_path, stop_after):
     expected = whole(sampler)
     stop_after(0, steps=3)
-    with pytest.raises(KeyboardInterrupt, match=r"stopped in the warm-up, after \d+ of \d+ steps; there are no draws"):
+    with pytest.raises(KeyboardInterrupt, match="warm-up"):
         fit(sampler, checkpoint=tmp_path / "run")
     stop_after(3)
     partial = fit(sampler, checkpoint=tmp_path / "run", resume=True)
     said = arviz_data.attributes(partial)["partial"]
     count = arviz_data.group(partial, "posterior").sizes["draw"]
-    assert 3 <= count < 6 and said == f"{count} of 6 draws a chain, without scores and trajectories"
+    assert 3 <= count < 6 and said.startswith(f"{count} of 6 draws")
     for name in ("posterior", "sample_stats"):
         xr.testing.assert_identical(arviz_data.group(partial, name),
                                     arviz_data.group(expected, name).isel(draw=slice(count)))
     assert_same(lfm.load(tmp_path / "run"), partial)
-    assert (arviz_data.summary(partial)["partial"] == f"{count} of 6 draws a chain").all()
+    assert arviz_data.summary(partial)["partial"].str.startswith(f"{count} of 6 draws").all()
     assert_same(fit(sampler, checkpoint=tmp_path / "run", resume=True), expected)
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["posterior.nc"]
     assert "partial" not in arviz_data.summary(expected)
 
 
-def test_chains_from_the_median_go_on_to_the_same_draws(whole, tmp_path, stop_after):
-    expected = whole("nuts", init="median")
-    stop_after(3)
-    assert "partial" in arviz_data.attributes(fit("nuts", init="median", checkpoint=tmp_path / "run"))
-    assert_same(fit("nuts", init="median", checkpoint=tmp_path / "run", resume=True), expected)
+def test_a_stop_after_sampling_costs_no_draw(whole, tmp_path, monkeypatch):
+    sampler = "ram"
 
-
-@pytest.mark.parametrize("sampler", ["ram", "map"])
-def test_a_stop_after_sampling_costs_no_draw(sampler, whole, tmp_path, monkeypatch):
     def stop(*arguments, lower=False, **keywords):
         if not lower:
             raise KeyboardInterrupt
@@ -137,7 +130,7 @@ def test_a_stop_after_sampling_costs_no_draw(sampler, whole, tmp_path, monkeypat
         patch.setattr("lfm_ppl.workflows.fit_results.trajectories", stop)
         partial = fit(sampler, checkpoint=tmp_path)
     said = arviz_data.attributes(partial)["partial"]
-    assert said == "all draws and their scores, without trajectories"
+    assert "trajectories" in said
     assert "log_likelihood" in arviz_data.groups(partial) and "trajectories" not in arviz_data.groups(partial)
     xr.testing.assert_identical(arviz_data.group(partial, "posterior"), arviz_data.group(whole(sampler), "posterior"))
     # Nothing is searched or sampled again.
@@ -158,25 +151,11 @@ def test_a_run_that_nothing_keeps_gives_what_it_has(whole, monkeypatch):
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(sampling._BlockLength, "adapt", stopping)
-    with pytest.raises(KeyboardInterrupt, match="stopped with 3 of 6 draws a chain.*sys.last_value.result") as raised:
+    with pytest.raises(KeyboardInterrupt, match="3 of 6 draws") as raised:
         fit("nuts")
-    assert arviz_data.attributes(raised.value.result)["partial"].startswith("3 of 6 draws a chain")
+    assert arviz_data.attributes(raised.value.result)["partial"].startswith("3 of 6 draws")
     np.testing.assert_array_equal(arviz_data.group(raised.value.result, "posterior")["noise"],
                                   arviz_data.group(whole("nuts"), "posterior")["noise"][:, :3])
-
-
-def test_a_second_request_ends_at_once(monkeypatch):
-    monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
-
-    def twice(self, seconds):
-        if self._is_compiled:
-            signal.raise_signal(signal.SIGINT)
-            signal.raise_signal(signal.SIGINT)
-        self._is_compiled = True
-
-    monkeypatch.setattr(sampling._BlockLength, "adapt", twice)
-    with pytest.raises(KeyboardInterrupt):
-        fit("ram")
 
 
 # Refusals
@@ -201,41 +180,32 @@ def unfinished(tmp_path_factory):
 
 
 def wider(times, y=None):
-    well(times, y, width=0.4)
+    relaxation(times, y, width=0.4)
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"seed": 3}, "seed was 0 and is 3"),
-    ({"samples": 7, "thin": 2}, "samples was 6 and is 7; thin was 5 and is 2"),
-    ({"y": Y + 1.0}, "this one: data differ"),
-    ({"times": TIMES + 0.5}, "times differ"),
-    ({"model": wider}, "this one: model differs"),
-    ({"at": [0.5, 4.5]}, "this one: times of the trajectories differ"),
-    ({"sampler_options": {"target_accept_prob": 0.5}}, "sampler_options target_accept_prob was not given and is 0.5"),
-    ({"chain_method": "sequential"}, "chain_method was vectorized and is sequential"),
-    ({"init": "map"}, "init was not given and is map"),
-    ({"model": approximate(well, steps=2)}, "this one: steps was 1 and is 2. Use"),  # and no word of the model
+@pytest.mark.parametrize(("changes", "name"), [
+    ({"seed": 3}, "seed"), ({"samples": 7, "thin": 2}, "thin"), ({"y": Y + 1.0}, "data"),
+    ({"times": TIMES + 0.5}, "times"), ({"model": wider}, "model"), ({"at": [0.5, 4.5]}, "trajectories"),
+    ({"sampler_options": {"target_accept_prob": 0.5}}, "target_accept_prob"),
+    ({"chain_method": "sequential"}, "chain_method"), ({"init": "map"}, "init"),
+    ({"model": approximate(relaxation, steps=2)}, "steps"),
 ])
-def test_another_run_is_not_gone_on_with(unfinished, changes, message):
+def test_another_run_is_not_resumed(unfinished, changes, name):
     before = {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()}
-    with pytest.raises(ValueError, match="cannot resume the run in .*run, which differs from this one: ") as raised:
+    with pytest.raises(ValueError, match=f"differs.*{name}"):
         fit("ram", checkpoint=unfinished, resume=True, **changes)
-    assert message in str(raised.value) and "Use the settings of that run" in str(raised.value)
     assert {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()} == before
 
 
-def test_other_versions_do_not_go_on(unfinished, monkeypatch):
-    versions = run_record.versions() | {"jax": "0.1"}
-    monkeypatch.setattr(run_record, "versions", lambda: versions)
-    with pytest.raises(ValueError, match=r"versions jax was \S+ and is 0.1\."):
-        fit("ram", checkpoint=unfinished, resume=True)
-
-
-def test_one_process_at_a_time(unfinished):
+def test_a_run_of_other_versions_or_in_use_is_not_resumed(unfinished, monkeypatch):
     first = Checkpoint.resume(unfinished, json.loads((unfinished / "checkpoint" / "run.json").read_text()))
-    with pytest.raises(RuntimeError, match="the run in .* is in use by another run"):
+    with pytest.raises(RuntimeError, match="in use"):
         fit("ram", checkpoint=unfinished, resume=True)
     first.close()
+    versions = run_record.versions() | {"jax": "0.1"}
+    monkeypatch.setattr(run_record, "versions", lambda: versions)
+    with pytest.raises(ValueError, match="jax"):
+        fit("ram", checkpoint=unfinished, resume=True)
 
 
 def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
@@ -245,22 +215,20 @@ def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
     monkeypatch.setattr(sampling, "run_chains", lambda *arguments: pytest.fail("it was sampled"))
     assert_same(fit("ram", checkpoint=tmp_path, resume=True), expected)
     assert (tmp_path / "posterior.nc").stat().st_mtime_ns == before.st_mtime_ns
-    with pytest.raises(ValueError, match="seed was 0 and is 1"):
+    with pytest.raises(ValueError, match="seed"):
         fit("ram", checkpoint=tmp_path, resume=True, seed=1)
-    with pytest.raises(FileExistsError, match="holds a result. Name another folder, or replace it with"):
+    with pytest.raises(FileExistsError):
         fit("ram", checkpoint=tmp_path)
 
 
 def test_folders_that_cannot_be_used(unfinished, tmp_path):
-    with pytest.raises(ValueError, match="resume continues a run that is stored in a folder; name the folder"):
-        fit("ram", resume=True)
-    with pytest.raises(FileExistsError, match="holds an unfinished run. Resume it with resume=True"):
-        fit("ram", checkpoint=unfinished)
     (tmp_path / "mine.txt").write_text("keep")
-    with pytest.raises(FileNotFoundError, match="holds files, but no run to resume"):
-        fit("ram", checkpoint=tmp_path, resume=True)
-    with pytest.raises(FileExistsError, match="mine.txt is a file; expected the name of a folder"):
-        fit("ram", checkpoint=tmp_path / "mine.txt")
+    for keywords, error, name in (
+            ({"resume": True}, ValueError, "folder"), ({"checkpoint": unfinished}, FileExistsError, ""),
+            ({"checkpoint": tmp_path, "resume": True}, FileNotFoundError, ""),
+            ({"checkpoint": tmp_path / "mine.txt"}, FileExistsError, "mine.txt")):
+        with pytest.raises(error, match=name):
+            fit("ram", **keywords)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
@@ -274,28 +242,6 @@ def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_draws_are_computed_in_batches_to_the_same_numbers_and_parts_of_other_batches_are_not_taken():
-    bound, count = lfm.bind(well, TIMES, Y), 10
-    draws = {"noise": np.linspace(0.5, 0.8, count)}
-
-    class Kept(dict):
-        def put(self, start, part):
-            self[start] = part
-
-        def flush(self):
-            pass
-
-    kept = Kept()
-    expected = scores(bound, draws, store=kept)
-    assert list(kept) == [0] and len(kept[0]["residual"]) == 12  # three batches of four in one program
-    for name, value in expected.items():
-        each = [scores(bound, {"noise": draws["noise"][k:k + 1]})[name][0] for k in range(count)]
-        np.testing.assert_allclose(value, each, rtol=1e-12, atol=1e-12)
-    other = Kept({0: {name: value[:3] for name, value in kept[0].items()}})
-    for name, value in scores(bound, draws, store=other).items():
-        np.testing.assert_array_equal(value, expected[name])
-
-
 # Accuracy
 
 
@@ -303,7 +249,7 @@ def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
     result = whole("map")
     monkeypatch.setattr("lfm_ppl.inference.map_draws._SEQUENTIAL_BATCH", 2)
     check = lambda **more: lfm.check_accuracy(  # noqa: E731
-        result, well, reference="particles", particles=20, draws=6, progress=False, **more).dataset
+        result, relaxation, reference="particles", particles=20, draws=6, progress=False, **more).dataset
     expected = check()
 
     def stopping(self, done):
@@ -314,9 +260,6 @@ def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
         patch.setattr(Progress, "advance", stopping)
         with pytest.raises(KeyboardInterrupt):
             check(checkpoint=tmp_path)
-    assert {path.name for path in (tmp_path / "checkpoint").iterdir() if path.is_dir()} == {
-        "log-likelihoods", "log-likelihoods-with-finer-steps", "log-likelihoods-with-more-iterations",
-        "particle-filter-20-particles"}
     put = checkpoints.Batches.put
     again = []
 
@@ -336,13 +279,9 @@ def test_where_there_is_no_terminal_lines_say_how_far_it_is(capfd, monkeypatch):
     monkeypatch.setattr("lfm_ppl.utils.progress.EVERY_S", 0.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        lfm.fit(well, TIMES, Y, sampler="nuts", **SIZES)
-    lines = [line for line in capfd.readouterr().err.splitlines()
-             if line.startswith("sampling: ") and "compiling" not in line]
-    assert lines[0].startswith("sampling: 1 of 14 steps, 0 of 6 draws a chain, ")
-    assert lines[-1].startswith("sampling: 14 of 14 steps, 6 of 6 draws a chain, ")
-    assert any(line.endswith("left at the pace of the warm-up so far") for line in lines[:-1])
-    assert "acceptance" in lines[-1] and "step size" in lines[-1]
+        lfm.fit(relaxation, TIMES, Y, sampler="nuts", **SIZES)
+    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("sampling: ")]
+    assert "14 of 14 steps" in lines[-1] and "acceptance" in lines[-1]
 
 
 def test_the_time_left_is_that_at_the_pace_of_the_last_minute(monkeypatch):
@@ -355,41 +294,13 @@ def test_the_time_left_is_that_at_the_pace_of_the_last_minute(monkeypatch):
         for done in range(1, 1001):
             clock[0] += 10.0 if done <= 100 else 1.0
             progress.advance(done, "words")
-    assert lines[0].endswith("words")  # the first step includes the compilation, which is not part of the pace
-    assert lines[99 - 1].endswith("; about 2.5 h left")  # 901 steps of 10 s
-    assert lines[200 - 1].endswith("; about 13 min left")  # 800 steps of 1 s: the slow ones are forgotten
-
-
-def test_whoever_waits_for_a_long_warm_up_is_told_once_what_helps(capfd, monkeypatch):
-    said = []
-    for seconds, init in ((0.0, "median"), (1e9, "median"), (0.0, None)):
-        monkeypatch.setattr("lfm_ppl.inference.sampling.SURE_S", 0.0)
-        monkeypatch.setattr("lfm_ppl.inference.sampling.LONG_S", seconds)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            lfm.fit(well, TIMES, Y, sampler="nuts", init=init, **SIZES)
-        said.append([line for line in capfd.readouterr().err.splitlines() if "this warm-up is slow" in line])
-    assert [len(lines) for lines in said] == [1, 0, 0]
-    assert said[0][0].startswith("note     ") and "without --init" in said[0][0]
-
-
-def test_what_tells_nothing_itself_is_told_of_as_long_as_it_lasts(capfd, monkeypatch):
-    monkeypatch.setattr("lfm_ppl.utils.progress.EVERY_S", 0.0)
-    monkeypatch.setattr("lfm_ppl.utils.progress._SHORTEST_S", 0.02)
-    with waiting("compiling", is_shown=True):
-        time.sleep(0.2)
-    time.sleep(0.1)
-    lines = capfd.readouterr().err.splitlines()
-    assert lines[0] == "compiling" and lines[-1].startswith("compiling (0.") and lines[-1].endswith(" s so far)")
-    time.sleep(0.1)
-    with waiting("compiling", is_shown=False):
-        time.sleep(0.1)
-    assert capfd.readouterr().err == ""
+    assert "2.5 h" in lines[99 - 1]  # 901 steps of 10 s
+    assert "13 min" in lines[200 - 1]  # 800 steps of 1 s: the slow ones are forgotten
 
 
 # The command line
 
-MODEL = '''"""A double well."""
+MODEL = '''"""A relaxation."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -404,7 +315,7 @@ OUTPUTS = ("x",)
 def model(times, y=None):
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
     system = lfm.LatentForceModel(
-        lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        lambda x, u, t: -x, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
         lfm.Gaussian(jnp.array([0.5]), jnp.array([[0.2]])), process_noise=noise * jnp.eye(1))
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1), obs=y)
 
@@ -416,11 +327,11 @@ def simulate(seed=0):
 
 def start(folder, *words):
     """Begin `lfm-ppl fit` in a process of its own."""
-    (folder / "well.py").write_text(MODEL)
+    (folder / "relaxation.py").write_text(MODEL)
     # Shells start what is in the background deaf to Ctrl-C, and so the tests, if they are.
     code = ("import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
             "from lfm_ppl.cli import main; sys.exit(main(sys.argv[1:]))")
-    command = [sys.executable, "-c", code, "fit", "well.py", "--quiet", "--chains", "2", "--out", "run", *words]
+    command = [sys.executable, "-c", code, "fit", "relaxation.py", "--quiet", "--chains", "2", "--out", "run", *words]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     if (cache := jax.config.jax_compilation_cache_dir) is not None:
         environment["JAX_COMPILATION_CACHE_DIR"] = cache
@@ -437,9 +348,12 @@ def drawn(folder):
         return 0
 
 
+RUN = ("--sampler", "ram", "--warmup", "10", "--samples", "1000000", "--thin", "50")
+
+
 def stopped(folder):
     """Run chains that would take hours, and stop them when there are draws: the process, what it said, seconds."""
-    process = start(folder, "--sampler", "ram", "--warmup", "10", "--samples", "1000000", "--thin", "50")
+    process = start(folder, *RUN)
     until = time.monotonic() + 200
     while not drawn(folder) and process.poll() is None and time.monotonic() < until:
         time.sleep(0.1)
@@ -449,64 +363,28 @@ def stopped(folder):
     return process, out, time.monotonic() - sent
 
 
-@pytest.mark.slow
-def test_ctrl_c_is_answered_within_ten_seconds(tmp_path):
-    process, out, took = stopped(tmp_path)
-    assert took < 10 and process.returncode == 130, out
-
-
-def test_ctrl_c_leaves_a_usable_result(tmp_path, monkeypatch, capsys):
-    process, out, _ = stopped(tmp_path)
-    assert process.returncode == 130, out
-    assert "stopping after this block of draws" in out
-    assert "resume   lfm-ppl fit well.py --quiet --chains 2 --out run --sampler ram" in out
+def test_ctrl_c_leaves_a_usable_result_within_ten_seconds(tmp_path):
+    process, out, seconds = stopped(tmp_path)
+    assert process.returncode == 130 and seconds < 10, out
     result = lfm.load(tmp_path / "run")
     count = arviz_data.group(result, "posterior").sizes["draw"]
     assert 0 < count < 1000000
-    assert arviz_data.attributes(result)["partial"].startswith(f"{count} of 1000000 draws a chain")
-    assert f"partial  {count} of 1000000 draws a chain" in out
-    assert f"{count} of 1000000 draws a chain" in (tmp_path / "run" / "summary.csv").read_text()
-    monkeypatch.chdir(tmp_path)
-    assert main(["plot", "run"]) == 0
-    assert "wrote run/trace.png" in capsys.readouterr().out
-
-    def report_stored_steps(key, sampler, starts, schedule, store, show_progress):
-        raise KeyboardInterrupt(f"{store.restore().done} steps are stored")
-
-    # This process orders its sets in another way, and takes the model for the same.
-    monkeypatch.setattr(sampling, "run_chains", report_stored_steps)
-    monkeypatch.setattr(sampling, "available_method", lambda *asked: "parallel")  # as with the devices there
-    assert main([*process.args[3:], "--resume"]) == 130
-    stored = re.search(r"(\d+) steps are stored", capsys.readouterr().err)
-    assert stored is not None and int(stored[1]) // 50 == count + 10
+    for said in (arviz_data.attributes(result)["partial"], out, (tmp_path / "run" / "summary.csv").read_text()):
+        assert f"{count} of 1000000 draws" in said
 
 
-def test_an_error_that_a_library_makes_of_an_interruption_is_one():
-    with pytest.raises(KeyboardInterrupt, match="interrupted; it is safe"), interruptible(lambda: "it is safe"):
-        raise ValueError("Cache keys should be comparable using __eq__. Traceback: sharding.py, line 154, "
-                         "KeyboardInterrupt:")
-    own = ValueError("an error of its own")
-    with pytest.raises(ValueError, match="an error of its own"), interruptible(lambda: "it is safe"):
-        raise own from own  # a ring
-
-
-def test_a_finished_run_says_so(tmp_path, monkeypatch, capsys):
-    (tmp_path / "well.py").write_text(MODEL)
+def test_a_finished_run_is_left_alone_by_the_command(tmp_path, monkeypatch):
+    (tmp_path / "relaxation.py").write_text(MODEL)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("lfm_ppl.results.plots.save_figures", lambda *arguments, **keywords: [])
-    line = ["fit", "well.py", "--sampler", "map", "--samples", "8", "--quiet", "--out", "run"]
+    line = ["fit", "relaxation.py", "--sampler", "map", "--samples", "8", "--quiet", "--out", "run"]
     assert main(line) == 0
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()}
     assert main([*line, "--resume"]) == 0
-    assert "the run in run is complete; nothing was changed" in capsys.readouterr().out
+    for words in ([*line, "--resume", "--seed", "2"], [*line, "--resume", "--overwrite"], line,
+                  [*line[:-2], "--resume"]):
+        assert main(words) == 2
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()} == before
-    assert main([*line, "--resume", "--seed", "2"]) == 2
-    assert "cannot resume the run in run, which differs from this one: seed was 0 and is 2" in capsys.readouterr().err
-    for words, message in ((["--resume", "--overwrite"], "give one of them"), ([], "run holds a result.")):
-        assert main([*line, *words]) == 2
-        assert message in capsys.readouterr().err
-    assert main([*line[:-2], "--resume"]) == 2
-    assert "name the folder with --out" in capsys.readouterr().err
 
 
 KILLS = 25

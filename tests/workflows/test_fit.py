@@ -15,7 +15,6 @@ from scipy.interpolate import CubicSpline
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.layout import Labels, checked_truth, unplaced
-from lfm_ppl.results.plots.saving import pages_of
 from tests.inference import linear_motif as motif
 
 TIMES = motif.TIMES
@@ -90,49 +89,34 @@ def test_groups_and_dimensions(nuts):
         assert {variable: dataset[variable].dims for variable in dataset.data_vars} == variables
 
 
-def test_coordinates_carry_names_times_and_units(nuts, y):
-    posterior, paths = group(nuts, "posterior"), group(nuts, "trajectories")
+def test_coordinates_carry_names_times_and_units(nuts, known, y):
+    posterior, paths, observed = (group(nuts, name) for name in ("posterior", "trajectories", "observed_data"))
     assert posterior["output"].values.tolist() == ["a", "b"]
-    assert (posterior.sizes["chain"], posterior.sizes["draw"]) == (2, 40)
-    assert paths["force"].values.tolist() == ["drive"]
-    assert paths["state"].values.tolist() == ["x0", "x1"]
-    assert (paths.sizes["chain"], paths.sizes["draw"]) == (2, 5)
+    assert (paths["force"].values.tolist(), paths["state"].values.tolist()) == (["drive"], ["x0", "x1"])
+    assert (posterior.sizes["draw"], paths.sizes["draw"]) == (40, 5)
     assert set(paths["draw"].values) <= set(posterior["draw"].values)
     np.testing.assert_array_equal(paths["at"], FORECAST)
-    observed = group(nuts, "observed_data")
-    np.testing.assert_array_equal(observed["time"], TIMES)
     np.testing.assert_array_equal(observed["y"], y)
-    for name in ("log_likelihood", "one_step_ahead", "posterior_predictive"):
+    for name in ("observed_data", "log_likelihood", "one_step_ahead", "posterior_predictive"):
         np.testing.assert_array_equal(group(nuts, name)["time"], TIMES)
         assert group(nuts, name)["time"].attrs["units"] == "h"
-    assert paths["at"].attrs["units"] == "h"
-    assert paths["forces"].attrs["units"] == "1/h"
-    assert observed["y"].attrs["units"] == "nM"
-    truth = group(nuts, "truth")["outputs"]  # the states themselves
-    np.testing.assert_array_equal(truth, np.ones((len(TIMES), 2)))
-    assert truth.attrs["units"] == "nM" and truth["output"].values.tolist() == ["a", "b"]
-
-
-def test_a_truth_may_be_that_of_a_deterministic_alone(known):
+    assert (paths["forces"].attrs["units"], observed["y"].attrs["units"]) == ("1/h", "nM")
+    np.testing.assert_array_equal(group(nuts, "truth")["outputs"], np.ones((len(TIMES), 2)))  # the states themselves
     truth = group(known, "truth")
     assert set(truth.data_vars) == {"deterministics"}
     np.testing.assert_array_equal(truth["deterministics"].sel(deterministic="rate"), np.cos(TIMES))
 
 
-def test_what_a_truth_says_of_something_else_is_told(y):
+def test_entries_of_a_truth_that_the_model_does_not_have_are_named(y):
     bound = lfm.bind(motif.model, TIMES, y)
     truth = {"times": TIMES, "forces": {"drvie": TIMES}, "state": np.ones((len(TIMES), 3)),
              "parameters": {**motif.THETA, "dacay": 1.0}, "deterministics": {"rate": TIMES}}
-    told = unplaced(bound, truth, Labels.of(bound))
-    assert [message.split(".")[0] for message in told] == [
-        "unknown force in the truth 'drvie'", "unknown parameter in the truth 'dacay'",
-        "the truth has 3 states, the model 2: x0, x1"]
-    assert all(message.endswith("It is left out of the figures.") for message in told)
-    with pytest.warns(UserWarning, match="unknown entry of the truth 'state_'. Did you mean 'state'"):
+    messages = unplaced(bound, truth, Labels.of(bound))
+    assert all(name in message for name, message in zip(("'drvie'", "'dacay'", "3 states"), messages, strict=True))
+    with pytest.warns(UserWarning, match="'state_'"):
         assert checked_truth(bound, {"state_": 0, "parameters": {}}, Labels.of(bound)) == {"parameters": {}}
-    with pytest.raises(ValueError, match="the truth is inconsistent: \"times\" must be"):
+    with pytest.raises(ValueError, match="times"):
         checked_truth(bound, {"times": 3.0}, Labels.of(bound))
-    assert unplaced(bound, {"parameters": motif.THETA}, Labels.of(bound)) == []
 
 
 def test_attributes_say_how_it_was_made(nuts):
@@ -141,42 +125,32 @@ def test_attributes_say_how_it_was_made(nuts):
     assert (attrs["seed"], attrs["chains"], attrs["warmup"], attrs["samples"]) == (0, 2, 60, 40)
     assert json.loads(attrs["fixed"]) == {"decay[b]": 1.2}
     assert set(json.loads(attrs["versions"])) >= {"lfm_ppl", "jax", "numpyro", "arviz", "python"}
-    assert attrs["wall_time_s"] > 0
-    assert attrs["created_at"].startswith("20")
-
-
-def test_sample_statistics(nuts):
+    assert attrs["wall_time_s"] > 0 and attrs["created_at"].startswith("20")
     statistics = group(nuts, "sample_stats")
     assert set(statistics.data_vars) == {"diverging", "acceptance_rate", "n_steps", "tree_depth", "energy", "step_size",
-                                    "lp"}
-    assert all(statistics[name].dims == ("chain", "draw") for name in statistics.data_vars)
-    assert statistics["diverging"].dtype == bool
-    assert ((statistics["acceptance_rate"] >= 0) & (statistics["acceptance_rate"] <= 1)).all()
+                                         "lp"}
     assert (statistics["n_steps"] <= 2 ** statistics["tree_depth"] - 1).all()
     # H = U + K, with K >= 0
     assert (statistics["energy"] >= -statistics["lp"] - 1e-9).all()
-
-
-def test_fixed_element_keeps_its_value_and_the_others_move(nuts):
     decay = group(nuts, "posterior")["decay"]
     np.testing.assert_allclose(decay.sel(output="b"), 1.2, rtol=1e-12)
     assert np.ptp(decay.sel(output="a").values) > 0
 
 
-def test_file_round_trip(nuts, known, tmp_path):
-    for index, result in enumerate((nuts, known)):
-        path = arviz_data.save(result, tmp_path / f"{index}.nc")
-        loaded = arviz_data.load(path)
-        assert set(arviz_data.groups(loaded)) == set(arviz_data.groups(result))
-        assert arviz_data.attributes(loaded) == arviz_data.attributes(result)
-        for name in arviz_data.groups(result):
-            xr.testing.assert_identical(group(loaded, name), group(result, name))
+def test_file_round_trip(nuts, tmp_path):
+    loaded = arviz_data.load(arviz_data.save(nuts, tmp_path / "result.nc"))
+    assert arviz_data.attributes(loaded) == arviz_data.attributes(nuts)
+    assert set(arviz_data.groups(loaded)) == set(arviz_data.groups(nuts))
+    for name in arviz_data.groups(nuts):
+        xr.testing.assert_identical(group(loaded, name), group(nuts, name))
 
 
 # Predictive densities
 
 
 def test_conditionals_equal_the_exact_ones_at_every_draw(nuts, y):
+    residual = group(nuts, "one_step_ahead")["residual"].values
+    np.testing.assert_array_equal(np.isnan(residual).all((0, 1)), np.isnan(y))
     posterior, conditional = group(nuts, "posterior"), group(nuts, "log_likelihood")["y"]
     ahead = group(nuts, "one_step_ahead")["log_density"]
     for chain, draw in ((0, 0), (1, 17), (1, 39)):
@@ -193,12 +167,6 @@ def test_conditionals_equal_the_exact_ones_at_every_draw(nuts, y):
             until[row + 1 :] = np.nan
             step = motif.log_density(until, **theta) - motif.log_density(before, **theta)
             np.testing.assert_allclose(ahead.values[chain, draw, row], step, rtol=1e-8, atol=1e-9)
-
-
-def test_residuals_are_missing_where_data_are(nuts, y):
-    residual = group(nuts, "one_step_ahead")["residual"].values
-    np.testing.assert_array_equal(np.isnan(residual).all((0, 1)), np.isnan(y))
-    np.testing.assert_array_equal(np.isnan(residual).any((0, 1)), np.isnan(y))
 
 
 def one_parameter(times, y=None):
@@ -274,12 +242,6 @@ def test_ram_posterior_on_a_line(line, y, density):
     np.testing.assert_allclose(statistics["lp"].values[0, :20], at, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_no_trajectories_where_none_are_asked_for(line):
-    assert "trajectories" not in arviz_data.groups(line)
-    assert "posterior_predictive" not in arviz_data.groups(line)
-
-
 # Trajectories
 
 
@@ -307,6 +269,8 @@ def test_trajectories_have_the_exact_joint_distribution(known, exact):
     forces = paths["forces"].values[0, :, :, 0]
     states = paths["states"].values[0].reshape(len(forces), -1)
     assert_moments(np.concatenate([forces, states], axis=1), mean[start:], covariance[start:, start:])
+    sd = np.sqrt(np.diag(covariance)[start:start + len(FORECAST)])
+    assert sd[-1] > sd[-2] > sd[-3]  # a forecast widens towards the prior
     np.testing.assert_array_equal(paths["outputs"], paths["states"])
 
 
@@ -316,17 +280,6 @@ def test_posterior_predictive_is_the_smoothed_state_and_noise(known, exact):
     size = 2 * len(TIMES)
     noise = motif.THETA["noise_sd"] ** 2 * np.eye(size)
     assert_moments(replicated.reshape(len(replicated), -1), mean[:size], covariance[:size, :size] + noise)
-
-
-def test_trajectories_agree_with_smooth(known, y):
-    smoothed = lfm.smooth(motif.build(**motif.THETA), TIMES, y, at=FORECAST)
-    forces = group(known, "trajectories")["forces"].sel(force="drive").values[0]
-    mean, sd = (np.asarray(part) for part in smoothed.force("drive"))
-    count = len(forces)
-    assert np.abs((forces.mean(0) - mean) / sd).max() < 4.5 / np.sqrt(count)
-    assert np.abs(forces.std(0) / sd - 1).max() < 4.5 / np.sqrt(2 * count)
-    # A forecast widens towards the prior
-    assert sd[-1] > sd[-2] > sd[-3]
 
 
 def test_bands_are_the_quantiles_of_the_mixture_over_the_draws(nuts, y):
@@ -377,11 +330,8 @@ def test_mode_of_known_parameters(known):
     # Independent draws have no chains: nothing to diagnose, and no trace to look at.
     table = arviz_data.summary(known)
     assert list(table) == ["mode", "mean", "sd", "q2.5", "q97.5"]
-    names = ["decay[a]", "decay[b]", "noise_sd"]
-    expected = [*np.asarray(motif.THETA["decay"]), motif.THETA["noise_sd"]]
-    np.testing.assert_allclose(table.loc[names, "mode"], expected, rtol=10 * NEAR)
-    drawn = [name for name, _, _ in pages_of(known, "full")]
-    assert "pairs" in drawn and "trace" not in drawn
+    expected = [*motif.THETA["decay"], motif.THETA["noise_sd"]]
+    np.testing.assert_allclose(table.loc[["decay[a]", "decay[b]", "noise_sd"], "mode"], expected, rtol=10 * NEAR)
 
 
 # Panels
@@ -397,7 +347,7 @@ def shared(times, y=None):
 
 
 @pytest.mark.slow
-def test_panel(tmp_path):
+def test_panel():
     times = TIMES[:4]
     y = np.stack([motif.data(seed=s, missing=False)[:4, :1] for s in (1, 2)])
     y[1, 3] = np.nan
@@ -416,10 +366,7 @@ def test_panel(tmp_path):
         theta = (posterior["decay"].values[1, 9, series, None], 1.5, posterior["noise_sd"].values[1, 9])
         exact = motif.log_density(y[series], *theta, times=times)
         np.testing.assert_allclose(ahead[1, 9, series].sum(), exact, rtol=1e-8)
-    loaded = arviz_data.load(arviz_data.save(result, tmp_path / "panel.nc"))
-    for name in arviz_data.groups(result):
-        xr.testing.assert_identical(group(loaded, name), group(result, name))
-    with pytest.raises(ValueError, match=r"\(2, 4, 1\) \(series, times, outputs\), got \(2, 3, 1\)"):
+    with pytest.raises(ValueError, match=r"\(2, 4, 1\)"):
         lfm.fit(shared, times, y[:, :3])
 
 
@@ -431,20 +378,15 @@ def test_the_same_seed_gives_the_same_result(y):
                 "init": init_to_uniform}
     with pytest.warns(lfm.ConvergenceWarning) as warned:
         first = lfm.fit(one_parameter, TIMES, y, progress=False, **settings)
-    said = " ".join(str(w.message) for w in warned)
-    assert "R-hat needs at least two chains and there is one" in said
-    assert "chains=4" in said
-    assert "effective sample size is below 100 (100 per chain) for decay" in said
-    assert "Raise samples" in said
+    messages = " ".join(str(w.message) for w in warned)
+    assert "R-hat" in messages and "decay" in messages
     again = quiet_fit(one_parameter, TIMES, y, **settings)
     other = quiet_fit(one_parameter, TIMES, y, **settings, seed=1)
     for name in ("posterior", "trajectories", "posterior_predictive", "log_likelihood"):
         xr.testing.assert_identical(group(again, name), group(first, name))
         assert not group(other, name).equals(group(first, name))
     attrs = arviz_data.attributes(first)
-    assert attrs["model"] == "one_parameter"
-    assert attrs["thin"] == 5, "for each parameter"
-    assert attrs["seed"] == 0
+    assert (attrs["model"], attrs["thin"]) == ("one_parameter", 5)  # five steps for each parameter
 
 
 def converted(times, y=None, start=None, max_step=None):
@@ -458,13 +400,10 @@ def converted(times, y=None, start=None, max_step=None):
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, max_step=max_step), obs=y)
 
 
-@pytest.mark.parametrize("keywords, sampler", [
-    pytest.param({}, "nuts", id="times as JAX array", marks=pytest.mark.slow),
-    pytest.param({"start": -1.0, "max_step": 0.1}, "nuts", id="initial time", marks=pytest.mark.slow),
-    pytest.param({"start": -1.0, "max_step": 0.1}, "map", id="initial time, from the mode")])
-def test_times_are_known_to_everything_after_sampling(y, keywords, sampler):
-    result = quiet_fit(converted, TIMES, y[:, :1], sampler=sampler, chains=1, warmup=5, samples=4, trajectory_draws=2,
-                       at=[0.5, 9.0], model_kwargs=keywords)
+def test_times_are_known_to_everything_after_sampling(y):
+    keywords = {"start": -1.0, "max_step": 0.1}
+    result = quiet_fit(converted, TIMES, y[:, :1], sampler="map", samples=4, trajectory_draws=2, at=[0.5, 9.0],
+                       model_kwargs=keywords)
     assert set(arviz_data.groups(result)) >= {"trajectories", "log_likelihood", "posterior_predictive"}
     assert group(result, "trajectories")["forces"].sizes["at"] == 2
     decay = float(group(result, "posterior")["decay"][0, 3])
@@ -480,7 +419,7 @@ def test_what_fails_after_sampling_does_not_cost_the_draws(y, monkeypatch):
         raise TypeError("no such thing")
 
     monkeypatch.setattr("lfm_ppl.workflows.fit_results.scores", broken)
-    with pytest.warns(UserWarning, match="scores of the observations could not be computed.*TypeError: no such thing"):
+    with pytest.warns(UserWarning, match="scores.*no such thing"):
         result = lfm.fit(one_parameter, TIMES, y, sampler="map", samples=5, trajectory_draws=0)
     assert group(result, "posterior")["decay"].shape == (1, 5)
     assert "log_likelihood" not in arviz_data.groups(result)
@@ -489,44 +428,20 @@ def test_what_fails_after_sampling_does_not_cost_the_draws(y, monkeypatch):
 # Errors
 
 
-@pytest.mark.parametrize(("change", "error", "message"), [
-    ({"sampler": "nut"}, ValueError, r"unknown sampler 'nut'\. Did you mean 'nuts'.*Known: nuts, ram, pmmh, map"),
-    ({"sampler": "hmc"}, ValueError, "unknown sampler 'hmc'.*Known: nuts, ram, pmmh, map"),
-    ({"sampler": "mcmc"}, ValueError, r"unknown sampler 'mcmc'\. Known: nuts, ram, pmmh, map"),
-    ({"chains": 0}, ValueError, "chains must be at least 1"),
-    ({"samples": 2.5}, TypeError, "samples must be a whole number, got 2.5"),
-    ({"thin": 0}, ValueError, "thin must be at least 1"),
-    ({"warmup": -1}, ValueError, "warmup must be at least 1"),
-    ({"trajectory_draws": -3}, ValueError, "trajectory_draws must be at least 1"),
-    ({"init": "mode"}, ValueError, "unknown init 'mode'.*Known: map, median"),
-    ({"init": 3}, TypeError, "init must be None"),
-    ({"sampler": "map", "init": "mode"}, ValueError, "unknown init 'mode'.*Known: map, median"),
-    ({"sampler": "map", "init": {"rates": 1.0}}, ValueError, "unknown site in init 'rates'"),
-    ({"chain_method": "threads"}, ValueError, "unknown chain_method 'threads'.*Known: parallel, vectorized"),
-    ({"fixed": {"decoy": 1.0}}, ValueError, r"unknown parameter to fix 'decoy'\. Did you mean 'decay'"),
-    ({"fixed": {"decay[c]": 1.0}}, ValueError, "unknown element of decay 'c'.*Known: a, b"),
-    ({"fixed": {"decay": 0.5, "lengthscale": 1.0, "noise_sd": 0.1}}, ValueError, "no parameters to sample"),
-    ({"fixed": {"decay": 0.5, "lengthscale": 1.0, "noise_sd": 0.1}, "sampler": "ram"}, ValueError, "no parameters"),
-    ({"at": [-1.0]}, ValueError, "lies before the initial time"),
-    ({"model_kwargs": {"width": 2}}, TypeError, "width"),
+@pytest.mark.parametrize(("change", "error", "name"), [
+    ({"sampler": "nut"}, ValueError, "'nut'"), ({"chains": 0}, ValueError, "chains"),
+    ({"samples": 2.5}, TypeError, "samples"), ({"thin": 0}, ValueError, "thin"), ({"warmup": -1}, ValueError, "warmup"),
+    ({"trajectory_draws": -3}, ValueError, "trajectory_draws"), ({"init": "mode"}, ValueError, "'mode'"),
+    ({"init": 3}, TypeError, "init"), ({"sampler": "map", "init": {"rates": 1.0}}, ValueError, "'rates'"),
+    ({"chain_method": "threads"}, ValueError, "'threads'"), ({"fixed": {"decay[c]": 1.0}}, ValueError, "'c'"),
+    ({"fixed": {"decay": 0.5, "lengthscale": 1.0, "noise_sd": 0.1}}, ValueError, "no parameters"),
+    ({"at": [-1.0]}, ValueError, "initial time"), ({"model_kwargs": {"width": 2}}, TypeError, "width"),
+    ({"y": np.zeros((7, 2))}, ValueError, r"\(8, 2\)"), ({"y": np.full((8, 2), np.inf)}, ValueError, r"y\[0, 0\]"),
+    ({"times": TIMES[::-1]}, ValueError, "times"),
 ])
-def test_wrong_arguments(y, change, error, message):
-    with pytest.raises(error, match=message):
-        lfm.fit(motif.model, TIMES, y, **{"progress": False, **change})
-
-
-@pytest.mark.parametrize(("times", "data", "message"), [
-    (TIMES, np.zeros((7, 2)), r"one row for each of the 8 times.*shape \(8, 2\); got \(7, 2\)"),
-    (TIMES, np.zeros((8, 3)), r"shape \(8, 2\); got \(8, 3\)"),
-    (TIMES, np.zeros(8), r"shape \(8, 2\); got \(8,\)"),
-    (TIMES, np.full((8, 2), np.nan), "every entry of y is missing"),
-    (TIMES, np.full((8, 2), np.inf), r"y\[0, 0\] is infinite"),
-    (TIMES[::-1], np.zeros((8, 2)), "times must not go back: row 1"),
-    (np.append(TIMES[:-1], np.nan), np.zeros((8, 2)), "times must be finite"),
-])
-def test_wrong_data(times, data, message):
-    with pytest.raises(ValueError, match=message):
-        lfm.fit(motif.model, times, data, progress=False)
+def test_wrong_arguments_are_named(y, change, error, name):
+    with pytest.raises(error, match=name):
+        lfm.fit(motif.model, **{"times": TIMES, "y": y, "progress": False, **change})
 
 
 def test_a_model_needs_exactly_one_likelihood_site(y):
@@ -537,10 +452,9 @@ def test_a_model_needs_exactly_one_likelihood_site(y):
         motif.model(times, y)
         numpyro.sample("z", lfm.MarginalLikelihood(motif.build(**motif.THETA), times), obs=y)
 
-    with pytest.raises(ValueError, match="exactly one site .*MarginalLikelihood.*found none"):
-        lfm.fit(without, TIMES, y)
-    with pytest.raises(ValueError, match="exactly one site .*found y, z"):
-        lfm.fit(twice, TIMES, y)
+    for model, name in ((without, "none"), (twice, "y, z")):
+        with pytest.raises(ValueError, match=f"site.*{name}"):
+            lfm.fit(model, TIMES, y)
 
 
 def steep(times, y=None):
@@ -552,11 +466,9 @@ def steep(times, y=None):
     numpyro.sample("y", lfm.MarginalLikelihood(model, times), obs=y)
 
 
-@pytest.mark.parametrize("sampler", [pytest.param("nuts", marks=pytest.mark.slow), "map"])
-def test_nowhere_to_start_from_is_explained(sampler):
-    times = np.array([0.0, 1.0, 2.0])
-    with pytest.raises(ValueError, match=r"finite density.*the prior median, the filter breaks down at row 1 \(time 1"):
-        lfm.fit(steep, times, np.ones((3, 1)), sampler=sampler, chains=1, warmup=2, samples=2, progress=False)
+def test_nowhere_to_start_from_is_explained():
+    with pytest.raises(ValueError, match="row 1"):
+        lfm.fit(steep, np.arange(3.0), np.ones((3, 1)), sampler="map", progress=False)
 
 
 def decaying_counts(times, y=None, fault=None):
@@ -599,16 +511,11 @@ def test_a_deterministic_state_is_fitted():
 
 
 @pytest.mark.parametrize("fault, reason", [
-    ("prior", "'level'"),
-    ("factor", "site 'bound' has the log density -inf"),
-    ("gradient", "log density is finite.*derivative with respect to 'rate'"),
-    ("function", r"observation function gives nan .* at row 4 \(time 4\)"),
-    ("law", r"y\[\d, 0\] = \d+ has the log density -inf"),
-    ("sites", "do not converge in 1 sweeps"),
-])
+    ("prior", "'level'"), ("factor", "'bound'"), ("gradient", "'rate'"), ("function", "row 4"),
+    pytest.param("law", "y", marks=pytest.mark.slow), pytest.param("sites", "1 sweeps", marks=pytest.mark.slow)])
 def test_the_part_that_fails_is_named_where_there_is_nowhere_to_start(fault, reason):
     times = 10.0 * np.arange(6.0) if fault == "law" else np.arange(6.0)
-    with pytest.raises(ValueError, match=f"finite density.*At the prior median, .*{reason}") as error:
+    with pytest.raises(ValueError, match=f"finite density.*{reason}") as error:
         lfm.fit(functools.partial(decaying_counts, fault=fault), times, DECAYING, progress=False, chains=1,
                 sampler="nuts" if fault == "gradient" else "map")
     assert "\n" not in str(error.value)
