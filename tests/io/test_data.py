@@ -65,7 +65,7 @@ def test_missing_cells(write, cell):
 
 
 @pytest.mark.parametrize(("text", "options", "words"), [
-    (b"", {}, ["row 1"]), (b"time,x\n", {}, ["no rows"]), (b"PK\x03\x04\xff\xfe\x00", {}, ["comma-separated"]),
+    (b"", {}, ["empty"]), (b"time,x\n", {}, ["no rows"]), (b"PK\x03\x04\xff\xfe\x00", {}, ["comma-separated"]),
     (b"time;x\n0;1,5\n", {}, ["'time;x'", "commas"]), (b"time,x\n0,1,5\n", {}, ["row 2", "3 cells"]),
     (b"time,x\n0\n", {}, ["row 2", "1 cells"]), (b"time,x,x\n0,1,2\n", {}, ["'x'", "columns 2, 3"]),
     (b"hour,x\n0,1\n", {}, ["hour, x", "--time-column"]), (b"time,t,x\n0,0,1\n", {}, ["time, t"]),
