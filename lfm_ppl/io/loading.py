@@ -211,8 +211,8 @@ def _checked(path: Path, module: ModuleType) -> ModelFile:
             raise ValueError(f"{path}: {name} must be {form}, got {definitions[name]!r}.")
     options = definitions.get("OPTIONS", {})
     for name, option in options.items():
-        is_valid = isinstance(option, tuple) and len(option) == 3 and isinstance(option[1], tuple | type)
-        if not is_valid or isinstance(option[1], tuple) and option[0] not in option[1]:
+        has_form = isinstance(option, tuple) and len(option) == 3 and isinstance(option[1], tuple | type)
+        if not has_form or isinstance(option[1], tuple) and option[0] not in option[1]:
             raise ValueError(f"{path}: OPTIONS[{name!r}] must be (default, tuple of choices or a type, help), with the "
                              f"default among the choices, got {option!r}.")
     parameters = inspect.signature(functions["model"]).parameters
