@@ -97,7 +97,7 @@ def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figur
     refuse_existing(path, overwrite)
     attrs = arviz_data.attributes(result)
     table = tables.annotated(arviz_data.summary(result), result)
-    pictures, failures = _drawn(result) if figures is None else (_read(figures), [])
+    pictures, failures = _draw_figures(result) if figures is None else (_read(figures), [])
     diagnostics = [name for name in _DIAGNOSTICS if name in table]
     description = str(attrs.get("description", "")).strip()
     has_accuracy = arviz_data.has_group(result, report.GROUP)
@@ -162,7 +162,7 @@ def _column_kinds(frame: pd.DataFrame) -> list[tuple[str, str]]:
             for name, column in frame.items()]
 
 
-def _drawn(result: Any) -> tuple[dict[str, bytes], list[str]]:
+def _draw_figures(result: Any) -> tuple[dict[str, bytes], list[str]]:
     """Return the figures of a result, name -> PNG, and a message for each that could not be drawn."""
     pictures, failures = {}, []
     for name, draw, names in saving.pages_of(result, "full"):

@@ -170,7 +170,7 @@ def fit(
           of each (``forces_summary`` and so on) and of new data (``new_data_summary``);
         - ``posterior_predictive``: replicated data along these trajectories. (``numpyro.infer.Predictive`` with the
           same draws simulates NEW forces instead.) ArviZ's predictive checks take one output at these draws:
-          ``az.plot_ppc_pit(result.sel(output="a", draw=result["trajectories"]["draw"]))``;
+          ``az.plot_ppc_pit(result.sel(output="a", draw=result["trajectories"]["draw"]))`` on ArviZ 1.x;
         - ``predictions``: with ``at``, new observations at these times, with noise; see `forecast`;
         - ``observed_data``, and ``truth`` and ``constant_data`` (known inputs) if there are any.
 
