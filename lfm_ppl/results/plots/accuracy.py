@@ -100,9 +100,8 @@ def _draw_ratios(axes: Axes, report: AccuracyReport) -> None:
     axes.set_title("exact filter" if report.exact else f"k = {report.k:.2f} (limit {report.threshold:.2f})")
 
 
-def _draw_densities(
-    axes: Axes, values: np.ndarray, subset: np.ndarray, weight: np.ndarray, line: dict[str, Any]
-) -> None:
+def _draw_densities(axes: Axes, values: np.ndarray, subset: np.ndarray, weight: np.ndarray,
+                    line: dict[str, Any]) -> None:
     flat = values.ravel()
     grid = np.linspace(*_range(flat, subset, weight), 200)
     support = flat.min(), flat.max()
@@ -133,10 +132,8 @@ def _bandwidth(values: np.ndarray, weight: np.ndarray, grid: np.ndarray) -> floa
     return max(1.06 * sd * (weight**2).sum() ** 0.2, 1e-3 * (grid[-1] - grid[0]))
 
 
-def _density(
-    grid: np.ndarray, values: np.ndarray, weight: np.ndarray, support: tuple[float, float],
-    bandwidth: float | None = None
-) -> np.ndarray:
+def _density(grid: np.ndarray, values: np.ndarray, weight: np.ndarray, support: tuple[float, float],
+             bandwidth: float | None = None) -> np.ndarray:
     """Return a Gaussian kernel density estimate that is reflected at both ends, so that it keeps its mass in between.
 
     Source: Silverman (1986), Density Estimation, section 2.10.

@@ -80,9 +80,8 @@ def plot_trace(result: Any, parameters: Sequence[str] | None = None, *, width: s
     return figure
 
 
-def parameters_to_draw(
-    result: Any, names: Sequence[str] | None, limit: int
-) -> tuple[dict[str, np.ndarray], list[str], str]:
+def parameters_to_draw(result: Any, names: Sequence[str] | None,
+                       limit: int) -> tuple[dict[str, np.ndarray], list[str], str]:
     """Return all scalar draws, the labels to draw, and a remark where some are left out."""
     posterior = group(result, "posterior")
     draws = scalar_draws(posterior)

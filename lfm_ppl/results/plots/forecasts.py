@@ -67,6 +67,8 @@ def forecast_window(result: Any) -> tuple[float, float] | None:
     last, end = forecast_span(result)
     times = group(result, "observed_data")["time"].values
     start = min(last - 2.0 * (end - last), times[-_FEWEST_ROWS:][0])
+    if has_group(result, "trajectories"):
+        start = min(start, group(result, "trajectories")["at"].values[-_FEWEST_ROWS:][0])
     return None if end - last >= _SMALLEST_SHARE * (end - times[0]) or start <= times[0] else (start, end)
 
 
