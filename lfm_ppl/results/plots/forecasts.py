@@ -143,10 +143,12 @@ def _draw_curves(axes: Axes, curves: Sequence[np.ndarray], start: tuple[float, .
     is_far = gaps > _LONGEST_GAP * np.median(gaps) if count >= _CURVES else np.ones(len(gaps), bool)
     is_bar = np.append(True, is_far) & np.append(is_far, True)
     broken = [np.insert(curve, np.flatnonzero(is_far) + 1, np.nan) for curve in (time, mean, *bounds)]
-    thickness = min(5.0, 10.0 * axes.figure.get_figwidth() / count)  # points; bars of a short forecast stay apart
+    inches = axes.figure.bbox.width / axes.figure.dpi
+    thickness = min(5.0, 10.0 * inches / count)  # points; bars of a short forecast stay apart
     for order, (label, tint) in enumerate(tints.items(), start=1):
+        low, high = broken[2 * order:2 * order + 2]
+        axes.fill_between(broken[0], low, high, color=tint, lw=0, zorder=order, label=label)
         low, high = bounds[2 * order - 2:2 * order]
-        axes.fill_between(broken[0], *broken[2 * order:2 * order + 2], color=tint, lw=0, zorder=order, label=label)
         breadth = thickness * (1.4 - 0.4 * order)
         axes.vlines(time[is_bar], low[is_bar], high[is_bar], color=tint, lw=breadth, zorder=order)
     axes.plot(broken[0], broken[1], color=line, zorder=3, label="posterior mean")

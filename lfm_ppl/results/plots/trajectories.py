@@ -257,7 +257,7 @@ def _draw_output(axes: Axes, result: Any, name: str) -> None:
         return forecasts.draw_outputs(axes, predicted)
     time, mean, low, high = _band(result, "output", name)
     is_covered = predicted is not None and set(time.tolist()) <= set(predicted["time"].values.tolist())
-    if is_covered and _summary(result, "outputs") is None:
+    if predicted is not None and is_covered and _summary(result, "outputs") is None:
         return forecasts.draw_outputs(axes, predicted)
     outer = _draw_new_data(axes, result, name, predicted if is_covered else None, (time, low, high))
     axes.fill_between(time, low, high, color=forecasts.NOISE_FREE, lw=0, zorder=2, label="95%, noise-free")
@@ -271,8 +271,9 @@ def _draw_new_data(axes: Axes, result: Any, name: str, predicted: xr.Dataset | N
                    inner: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[float, float]:
     """Draw the band of new data about ``inner``, times and ends of the noise-free band; return its last ends."""
     summary, step = _summary(result, "new_data"), None
+    band: tuple[np.ndarray, ...]
     if summary is not None:
-        band = inner[0], *summary.sel(output=name).values[1:]
+        band = (inner[0], *summary.sel(output=name).values[1:])
     elif predicted is not None:
         band = forecasts.new_data_band(predicted)
     elif has_group(result, "posterior_predictive"):
@@ -280,8 +281,9 @@ def _draw_new_data(axes: Axes, result: Any, name: str, predicted: xr.Dataset | N
         band, step = _band_of_draws(draws, *inner)
     else:
         return inner[1][-1], inner[2][-1]
-    axes.fill_between(*band, color=forecasts.PREDICTIVE, lw=0, zorder=1, step=step, label="95%, new data")
-    return band[1][-1], band[2][-1]
+    time, low, high = band
+    axes.fill_between(time, low, high, color=forecasts.PREDICTIVE, lw=0, zorder=1, step=step, label="95%, new data")
+    return low[-1], high[-1]
 
 
 def _band_of_draws(predictive: xr.DataArray, positions: np.ndarray, low: np.ndarray,
