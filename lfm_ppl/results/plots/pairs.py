@@ -15,12 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.plots.chains import (
-    divergences,
-    known_truth,
-    parameter_units,
-    parameters_to_draw,
-)
+from lfm_ppl.results.plots.chains import divergences, known_truth, parameter_units, parameters_to_draw
 
 _SMALLEST, _MARGIN = 0.77, 0.8  # inches: a panel that holds its labels, the room beside them
 MAX_POINTS = 2000
