@@ -49,7 +49,7 @@ def _one_line(error: Exception) -> str:
 
     text = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, CycloptsError):
-        return text
+        return f"{text} (see `{' '.join(['lfm-ppl', *(error.command_chain or ())])} --help`)"
     from lfm_ppl.io import loading
 
     text, location = text + _remedy(error), loading.place_in_model(error)

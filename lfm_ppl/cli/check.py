@@ -63,12 +63,16 @@ def run(result: str, options: CheckOptions, line: Sequence[str]) -> int:
             folder = stack.enter_context(results.folder(task.name, out, replace))
             checkpoint.check_folder(folder, options.resume, options.overwrite)
         stack.enter_context(interruptible(lambda: f"resume with: {resume}"))
-        report = settled or _check(task, options, path.parent / UNFINISHED)
+        report = settled or check_accuracy(
+            posterior, task.model, reference=options.reference,
+            draws=options.draws or (_DRAWS_TO_CORRECT if options.correct else _DRAWS), particles=options.particles,
+            model_kwargs=task.keywords, seed=options.seed, progress=not options.quiet,
+            checkpoint=path.parent / UNFINISHED, resume=options.resume)
         for message in arviz_data.convergence_warnings(posterior):
             warnings.warn(f"the draws that are checked: {message}", stacklevel=1)
         if settled is None:
             print(f"\n{report.text(command=False)}\n")
-            status = _write(report, task.posterior, path, command)
+            status = _write(report, posterior, path, command)
         else:
             _check_likelihood(task)
             print(f"checked  before: k = {report.k:.4g} is not below {report.threshold:.4g}, so that no weights of "
@@ -110,14 +114,6 @@ def _check_likelihood(task: StoredFit) -> None:
     problem = rebuilding.problem(task.posterior, task.model, model_kwargs=task.keywords).select(rows)
     log_likelihoods = likelihoods.recorded(problem, likelihoods.gaussian(problem))
     rebuilding.check_likelihood(task.posterior, log_likelihoods.reshape(chains, len(draw_indices)), draw_indices)
-
-
-def _check(task: StoredFit, options: CheckOptions, folder: Path) -> AccuracyReport:
-    return check_accuracy(
-        task.posterior, task.model, reference=options.reference,
-        draws=options.draws or (_DRAWS_TO_CORRECT if options.correct else _DRAWS), particles=options.particles,
-        model_kwargs=task.keywords, seed=options.seed, progress=not options.quiet, checkpoint=folder,
-        resume=options.resume)
 
 
 def _write(report: AccuracyReport, posterior: Any, path: Path, command: str) -> int:

@@ -28,7 +28,7 @@ from lfm_ppl.inference.bind import bind
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
 from lfm_ppl.io.truth import read_truth
-from lfm_ppl.results import arviz_data, checkpoint, files, tables
+from lfm_ppl.results import arviz_data, checkpoint, files, html_report, tables
 from lfm_ppl.utils import calendar_time
 from lfm_ppl.utils.interruption import INTERRUPTED, interruptible
 from lfm_ppl.utils.progress import duration
@@ -65,14 +65,14 @@ def run(name: str, options: FitOptions, line: Sequence[str]) -> int:
         resume = page.command_line(line, *([] if output.out else ["--out", str(folder)]), "--resume")
         start_time = time.perf_counter()
         with interruptible(lambda: _remains(folder, resume)):
-            posterior = sample(
+            posterior = lfm_ppl.fit(
                 numpyro_model, observed, at=times, model_kwargs=keywords, fixed=fixed, progress=not output.quiet,
                 name=model.name, checkpoint=folder, resume=output.resume,
                 attributes=result_attributes(options, line, model, observed, model_options),
                 **sampling_arguments(options, model))
             partial = arviz_data.attributes(posterior).get("partial")
             # The report is written last: without it the run was killed while it drew its figures.
-            if is_finished and partial is None and page.exists(folder):
+            if is_finished and partial is None and (folder / html_report.NAME).is_file():
                 print(f"\nthe run in {folder} is complete; nothing was changed")
                 return 0
             status = report(posterior, folder, time.perf_counter() - start_time, output.overwrite or output.resume)
@@ -80,11 +80,6 @@ def run(name: str, options: FitOptions, line: Sequence[str]) -> int:
             return status
         print(f"partial  {partial}\nresume   {resume}")
         return INTERRUPTED
-
-
-def sample(*arguments: Any, **keywords: Any) -> Any:
-    """Return the result of `lfm_ppl.fit`; an unfinished run stays in the folder."""
-    return lfm_ppl.fit(*arguments, **keywords)
 
 
 def _remains(folder: Path, resume: str) -> str:

@@ -67,7 +67,8 @@ def run(result: str, options: ForecastOptions, line: Sequence[str]) -> int:
         task = rebuild_fit(posterior, options.model, path)
         held_out = None if options.held_out is None else _held_out_data(options.held_out, options, task)
         forecast, scores = _forecast(options, task, held_out)
-        forecast[GROUP].attrs["command_line"] = page.command_line(line)
+        group = arviz_data.group(forecast, GROUP).assign_attrs(command_line=page.command_line(line))
+        forecast = arviz_data.add_group(forecast, GROUP, group)
         return _write(forecast, scores, task, path, folder, options)
 
 
@@ -77,7 +78,7 @@ def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) 
     known_inputs = {}
     if held_out is not None:
         times = np.union1d(times, held_out.times)
-        known_inputs = {name: Input(*dataclasses.astuple(joined(task.observed.inputs[name], later)))
+        known_inputs = {name: Input(*joined(task.observed.inputs[name], later))
                         for name, later in held_out.inputs.items()}
     keywords: dict[str, Any] = {"inputs": known_inputs, "model_kwargs": task.keywords}
     forecast = lfm_ppl.forecast(task.posterior, task.model, times, draws=options.draws, seed=options.seed,

@@ -38,7 +38,7 @@ def test_new_chains_follow_a_check_that_requires_them(run, well, fitted, monkeyp
     arviz_data.save(arviz_data.add_group(result, "accuracy", report), fitted / "posterior.nc", overwrite=True)
     reports = []
     monkeypatch.setattr("lfm_ppl.cli.check._correct", lambda task, report, *rest: reports.append(report) or 0)
-    monkeypatch.setattr("lfm_ppl.cli.check._check", lambda *rest: pytest.fail("checked again"))
+    monkeypatch.setattr("lfm_ppl.cli.check.check_accuracy", lambda *rest, **keywords: pytest.fail("checked again"))
     status, out, err = run(f"check {fitted} --correct")
     assert status == 0 and reports[0].k == 0.9, err
     changed = fitted.parent / "changed.py"

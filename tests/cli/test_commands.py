@@ -26,7 +26,7 @@ COMMANDS = ["models", "new", "simulate", "fit", "forecast", "check", "compare", 
 @pytest.fixture
 def without_sampling(monkeypatch, original):
     """Let `fit` return the stored result instead of sampling."""
-    monkeypatch.setattr("lfm_ppl.cli.fit.sample", lambda *arguments, **keywords: arviz_data.load(original))
+    monkeypatch.setattr("lfm_ppl.fit", lambda *arguments, **keywords: arviz_data.load(original))
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -159,7 +159,7 @@ def test_folders_are_numbered_and_not_left_empty(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("line", ["fit spring --out taken/r", "simulate spring --out taken/d.csv", "fit spring"])
 def test_a_path_that_cannot_be_written_is_an_error_before_the_computation(run, tmp_path, monkeypatch, line):
-    monkeypatch.setattr("lfm_ppl.cli.fit.sample", lambda *task, **keywords: pytest.fail("it was computed"))
+    monkeypatch.setattr("lfm_ppl.fit", lambda *task, **keywords: pytest.fail("it was computed"))
     for name in ("taken", "lfm-results"):
         (tmp_path / name).write_text("keep")
     status, _, err = run(line)
