@@ -200,7 +200,7 @@ def _add_study(name: str, keep_programs: bool) -> None:
         declaration, is_variadic = field.metadata["declaration"], Ellipsis in get_args(value_type)
         metavar = " ".join(declaration.parts).upper() if declaration.parts else declaration.metavar or (
             "N" if "int" in str(value_type) else "NAME")
-        annotation = Annotated[value_type, Parameter(
+        annotation: Any = Annotated[value_type, Parameter(
             alias=declaration.aliases, choices=declaration.choices, show_choices=field.default != declaration.choices,
             consume_multiple=is_variadic, metavar=metavar + "..." * is_variadic, group=group, help=declaration.help,
             show_default=_default)]

@@ -203,7 +203,7 @@ class LatentForceModel(eqx.Module):
             raise ValueError(f"dynamics must return one derivative for each of the {size} entries of "
                              f"initial_state.mean, shape ({size},); it returned {_describe(dynamics.shape)}."
                              f"{'' if shape else ' Return jnp.array([...]).'}")
-        noise = (size, 0) if process_noise is None else getattr(process_noise.shape, "shape", ())
+        noise: tuple[int, ...] = (size, 0) if process_noise is None else getattr(process_noise.shape, "shape", ())
         if len(noise) != 2 or noise[0] != size:
             raise ValueError(f"process_noise must return a dispersion matrix ({size}, S), got {noise}.")
 

@@ -140,7 +140,8 @@ class TracedFunction:
                 # Inside compiled code arithmetic on JAX arrays would give tracers.
                 operands = [value if isinstance(value, Unknown) or checks.traced(value) else np.asarray(value)
                             for value in step.operands[-3:]]
-                yield TableRead(name, *operands, step.is_conditional)
+                times, values, time = operands
+                yield TableRead(name, times, values, time, step.is_conditional)
 
 
 def trace(label: str, form: str, function: Callable, *arguments: Any) -> TracedFunction:

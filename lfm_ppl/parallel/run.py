@@ -80,7 +80,8 @@ def outcomes(tasks: Iterable[Task], compute: Compute, folder: str | Path | None,
         results = {} if store is None else {stem: _stored(task, store, overwrite) for stem, task in by_stem.items()}
         missing = [task for stem, task in by_stem.items() if results.get(stem) is None]
         done = len(by_stem) - len(missing)
-        progress = stack.enter_context(TaskProgress(report, len(by_stem), done))
+        progress = TaskProgress(report, len(by_stem), done)
+        stack.enter_context(progress)
         if done:
             progress.write(f"{done} of {len(by_stem)} tasks are stored already")
         for stem in list(results):

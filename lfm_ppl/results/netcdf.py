@@ -56,7 +56,7 @@ def read(path: str | Path) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
     try:
         with xr.open_datatree(path, engine="h5netcdf", decode_times=False, decode_timedelta=False) as tree:
             datasets = {name: node.to_dataset().load() for name, node in tree.children.items()}
-            attributes = {name: _decode(value) for name, value in tree.attrs.items()}
+            attributes = {str(name): _decode(value) for name, value in tree.attrs.items()}
     except (OSError, KeyError) as error:
         raise ValueError(
             f"{path} could not be read as a netCDF file ({error}). Expected a file written by lfm_ppl, such as the "

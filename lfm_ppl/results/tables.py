@@ -42,7 +42,7 @@ def format_number(value: Any, digits: int = 3) -> str:
     if value == 0.0:
         return "0"
     scientific = f"{value:.{digits - 1}e}"
-    if not 1e-4 <= abs(value) < 1e6:
+    if not 1e-4 <= abs(float(value)) < 1e6:
         return scientific
     # 9.999 has its leading digit at 1 before it is rounded, and at 10 afterwards.
     exponent = int(scientific.partition("e")[2])

@@ -124,11 +124,11 @@ class RunStore:
         try:
             with np.load(path) as file:
                 arrays = {key: file[key] for key in file.files}
-            stored = record if record is None else json.loads(str(arrays.pop(_RECORD)))
+            stored: Any = None if record is None else json.loads(str(arrays.pop(_RECORD)))
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise DamagedFileError(f"{path} is damaged ({type(error).__name__}: {error}). Start the run anew with "
                                    "overwrite=True (--overwrite), or in another folder.") from error
-        if stored == record:
+        if record is None or stored == record:
             return arrays
         if overwrite:
             return None
