@@ -4,7 +4,7 @@ An index out of range raises in NumPy. Compiled code cannot raise: JAX uses the 
 likelihood of ``u[7]`` is finite for a model of one force.
 
 1. `trace` traces a function once; its errors explain how to rewrite functions that cannot be traced.
-2. `_walk` yields the equations of a jaxpr, including those of inner functions, with the values of operands that are
+2. `_walk` yields the equations of a jaxpr and of the functions it calls, with the values of operands that are
    constants, known arguments, or computed from these.
 3. `TracedFunction.check_indices` compares known indices of slices, gathers and scatters with the shapes of the arrays.
    (`jax.experimental.checkify` would also refuse indices whose ``mode`` defines the result out of range, and indices
@@ -206,7 +206,7 @@ class _Step(NamedTuple):
 
 def _walk(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], source: Any = None,
           is_conditional: bool = False) -> Generator[_Step, None, list[Any]]:
-    """Yield every equation, including those of inner functions, branches and loops; return the outputs.
+    """Yield the equations of a jaxpr and of its inner functions, branches and loops; return the outputs.
 
     Args:
         jaxpr: the jaxpr.
