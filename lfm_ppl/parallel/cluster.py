@@ -89,10 +89,12 @@ def _start_processes(count: int, stack: contextlib.ExitStack) -> Cluster:
         cache = {_CACHE_FOLDER: stack.enter_context(tempfile.TemporaryDirectory(prefix="lfm-ppl-")), _SHORTEST: 0.0}
     # The profiler of the dashboard samples the stack every hundredth of a second.
     stack.enter_context(dask.config.set({"distributed.worker.profile.enabled": False}))
-    # JAX keeps freed memory, so that a memory limit would pause workers for good.
+    # JAX keeps freed memory, so that a memory limit would pause workers for good. Ctrl-C is for this process alone; it
+    # ends the workers, which would print tracebacks otherwise.
     processes = stack.enter_context(LocalCluster(
         n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=0,
-        dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL))
+        dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
+        preload=["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"]))
     return Cluster(stack.enter_context(Client(processes)), cache)
 
 

@@ -26,11 +26,6 @@ class Task:
         seed: seed of the computation; seed and name determine the random key of the task.
         settings: values that the result depends on, storable as JSON.
         data: further arguments, such as arrays, which are not stored. Put a digest of them into the settings.
-
-    Example:
-        >>> task = Task("state/EKF/007", 0, {"model": "ginzburg-landau", "steps": 60})
-        >>> task.stem
-        'state-EKF-007'
     """
 
     name: str
