@@ -15,7 +15,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any, TextIO
+from typing import Any, Self, TextIO
 
 from lfm_ppl.utils import checks
 
@@ -78,7 +78,7 @@ class Progress:
             self._bar = tqdm(total=total, initial=done, desc=label, file=report.file or sys.stderr, dynamic_ncols=True,
                              bar_format="{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]")
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: Any) -> None:

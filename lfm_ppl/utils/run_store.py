@@ -124,7 +124,7 @@ class RunStore:
         try:
             with np.load(path) as file:
                 arrays = {key: file[key] for key in file.files}
-            stored: Any = None if record is None else json.loads(str(arrays.pop(_RECORD)))
+            stored = {} if record is None else json.loads(str(arrays.pop(_RECORD)))
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise DamagedFileError(f"{path} is damaged ({type(error).__name__}: {error}). Start the run anew with "
                                    "overwrite=True (--overwrite), or in another folder.") from error
@@ -132,7 +132,7 @@ class RunStore:
             return arrays
         if overwrite:
             return None
-        old, new = ({**settings, **settings.get("settings", {}), "settings": None} for settings in (stored, record))
+        old, new = ({**entries, **entries.get("settings", {}), "settings": None} for entries in (stored, record))
         differences = [f"{key} is {old.get(key)!r} there and {new.get(key)!r} now"
                        for key in {**old, **new} if old.get(key) != new.get(key)]
         raise ValueError(f"{path} holds a result with other settings: {', '.join(differences[:3])}. Choose another "
