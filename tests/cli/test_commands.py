@@ -82,9 +82,10 @@ def test_a_model_is_described(run, well, tmp_path):
 def test_a_new_model_is_described_and_fitted_at_once(run):
     assert run("new my_model.py")[0] == 0
     assert run("models my_model.py")[0] == 0
-    status, _, err = run("fit my_model.py --sampler map --samples 50 --quiet --out result")
-    assert status == 0, err
+    status, out, err = run("fit my_model.py --sampler map --samples 50 --set noise_sd=0.3 --quiet --out result")
+    assert status == 0 and "fixed    noise_sd = 0.3" in out, err
     posterior = arviz_data.group(arviz_data.load("result"), "posterior")
+    assert set(posterior.data_vars) == {"loss", "scale", "lengthscale", "half_life"}
     np.testing.assert_allclose(posterior["half_life"], np.log(2) / posterior["loss"])
     # The truth is 0.3; the prior's own width is 0.5 in the logarithm.
     assert abs(np.log(posterior["loss"]).mean() - np.log(0.3)) < 1.0
@@ -111,9 +112,9 @@ def test_simulated_files_can_be_fitted(run, well, tmp_path):
     assert status == 0, err
     np.testing.assert_array_equal(pd.read_csv("d.csv")["x"], loading.load(well).simulate(seed=5).y[:, 0])
     command = out.split("lfm-ppl ", 1)[1].strip()
-    status, out, err = run(f"{command} --sampler map --samples 20 --set depth=0.9 --rule unscented --quiet --out r")
+    status, out, err = run(f"{command} --sampler map --samples 20 --rule unscented --quiet --out r")
     assert status == 0, err
-    assert "d.csv: 6 rows of x; 1 values missing" in out and "fixed    depth = 0.9" in out and "noise = 0.2" in out
+    assert "d.csv: 6 rows of x; 1 values missing" in out and "noise = 0.2" in out
     assert float(arviz_data.group(arviz_data.load("r"), "truth")["depth"]) == 1.0
     assert run(f"simulate {well} --out d.csv")[0] == 2
 
