@@ -1,7 +1,5 @@
 """Constrained study: records, the source's estimator, bands, and a quick run."""
 
-from pathlib import Path
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,11 +9,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import truncnorm
 
 import lfm_ppl as lfm
-from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.constrained import estimators, experiment, figures, problem
-from lfm_ppl.experiments.study import TASKS
-from lfm_ppl.inference.optimise import Objective
-from lfm_ppl.utils.run_store import RunStore
+from lfm_ppl.experiments.constrained import estimators, problem
 
 
 @pytest.mark.parametrize("shape", problem.SHAPES)
@@ -29,18 +23,6 @@ def test_records_follow_their_equation(shape):
     residual = record.y[:, 0] - integral
     assert abs(residual.mean()) < 4 * 0.025 / np.sqrt(1501) + 2e-3
     assert residual.std() == pytest.approx(0.025, rel=0.08)
-
-
-def test_the_window_has_the_printed_cost():
-    """Covariances of which `lfm.full_information` makes half of the cost in equations 10g and 10h of the source."""
-    model = problem.companion(0.8, jnp.array([0.1, 0.5, -0.2]))
-    np.testing.assert_allclose(model.initial_state.covariance, np.linalg.inv(2 * 1e-2 * np.eye(3)))
-    noise = np.asarray(model.process_noise) @ np.asarray(model.process_noise).T
-    np.testing.assert_allclose(2.0 * noise[:2, :2], np.diag([1e-6, 0.0]))
-    # Without the factor 2 the force is a Matern process of scale 1: Lyapunov's equation for its stationary covariance.
-    columns = [model.dynamics(jnp.array(unit), jnp.zeros(0), 0.0)[1:] for unit in ([0.0, 1.0, 0.0], [0.0, 0.0, 1.0])]
-    feedback, stationary = np.stack(columns, axis=1), np.diag([1.0, 3.0 / 0.8**2])
-    np.testing.assert_allclose(feedback @ stationary + stationary @ feedback.T, -2.0 * noise[1:, 1:], atol=1e-12)
 
 
 def test_the_shortest_band_of_a_truncated_normal():
@@ -64,26 +46,6 @@ def test_the_shortest_band_of_a_truncated_normal():
         assert exact.cdf(bounds[1]) - exact.cdf(bounds[0]) == pytest.approx(0.95, abs=2e-3)
         assert (bounds[0] == 0.0) == (y < 0)
         assert bounds[1] - bounds[0] == pytest.approx(widths.min(), rel=0.02)
-
-
-def test_the_shortest_interval_of_a_mixture():
-    """Of two uniform distributions side by side, nine tenths in the narrow one: 95% reach into the wide one."""
-    values = jnp.concatenate([jnp.tile((jnp.arange(40) + 0.5) / 40, 9), 1.0 + 10.0 * (jnp.arange(40) + 0.5) / 40])
-    low, high = estimators.shortest_interval(jnp.stack([values, -values], axis=1))
-    assert np.isfinite(low).all()
-    np.testing.assert_allclose([low[0], high[0]], [0.0, 6.0], atol=0.3)
-    np.testing.assert_allclose([low[1], high[1]], [-high[0], -low[0]], rtol=1e-12)
-
-
-def test_a_patient_without_curvature_has_its_mode():
-    """An infinite index says so; the others of its block are kept."""
-    class Flat:
-        def objective(self, y):
-            return Objective(lambda z: (jnp.sum(z**2), jnp.full_like(z, jnp.nan)))
-
-    draws, k = estimators.sample_parameters(Flat(), np.zeros(1), np.array([0.3, -0.2]), 0, 16, 150)
-    np.testing.assert_array_equal(draws, np.tile([0.3, -0.2], (16, 1)))
-    assert k == np.inf
 
 
 def matrices(rate, weight, step):
@@ -130,62 +92,6 @@ def test_the_rate_as_a_constant_state_against_a_search_on_the_dense_cost():
     np.testing.assert_allclose(estimate.state("factor"), force, atol=2e-5)
 
 
-def test_times_of_peaks():
-    times = np.linspace(0.0, 24.0, 241)
-    path = 1.0 + 0.5 * np.cos(2 * np.pi * (times - 23.5) / 24.0)
-    assert estimators.acrophase_time(times, path[None])[0] == pytest.approx(23.5)
-    assert estimators.peak_time(times, path[None])[0] == pytest.approx(23.5)
-    assert estimators._distance_of_hours(np.array([23.5]), np.array([0.5]))[0] == pytest.approx(1.0)
-
-
-def store_results(folder, settings):
-    """Store invented results of every task."""
-    random = np.random.default_rng(0)
-    for task in experiment.all_tasks(settings):
-        count, kind = task.settings["count"], task.settings["what"]
-        if kind == "transcription":
-            path = np.abs(random.normal(size=(3, len(problem.TIMES))))
-            result = {"truth": path[0]}
-            for label, method in estimators.METHODS.items():
-                result |= {f"{label}/mse": random.uniform(1e-3, 1e-2, count), f"{label}/minimum": np.zeros(count),
-                           f"{label}/coverage": np.full(count, 0.95), f"{label}/failed": np.zeros(count, bool),
-                           f"hyperparameters/{method.hyperparameters}": np.ones((count, 2)),
-                           f"{label}/first": np.sort(path, axis=0)[[1, 0, 2], ::method.every]}
-        elif kind == "ballistic":
-            paths = random.normal(size=(3, len(problem.TARGET_TIMES)))
-            result = {"rmse": random.uniform(size=(count, 3)), "converged": np.ones(count, bool), "estimate": paths,
-                      "truth": paths}
-        else:
-            times, hours = np.linspace(0.0, 24.0, 51), np.arange(25.0)
-            paths = np.abs(random.normal(size=(count, 51)))
-            result = {"times": times, "truth": paths, "mode": paths, "low": 0.5 * paths, "high": 2 * paths,
-                      "coverage": np.ones(count), "peak": random.uniform(0.0, 2.0, (count, 2)), "rmse": np.ones(count),
-                      "k": np.where(np.arange(count) == 0, np.inf, 0.2),
-                      "converged": np.ones(count, bool), "bands_converged": np.ones(count, bool),
-                      "y": random.normal(size=(25, 3)), "measured": hours}
-        RunStore(Path(folder) / TASKS).put(task.stem, result, task.record())
-
-
-def test_tables_and_figures_from_stored_results(tmp_path):
-    settings = experiment.ConstrainedSettings(runs=3, patients=4, targets=3, block=2)
-    store_results(tmp_path, settings)
-    study_result = experiment.STUDY.run(settings, tmp_path)
-    assert study_result.tables["transcription"].loc["delayed MHE, 60 samples", "published"] == 0.0103
-    assert study_result.tables["others"].loc["patients, Pareto k above 0.7", "value"] == 0.5  # one in each block of two
-    mse = np.concatenate([study_result.results[task.name]["EP/mse"] for task in experiment.all_tasks(settings)
-                          if task.settings["what"] == "transcription"])
-    assert mse.shape == (12,) and study_result.tables["transcription"].loc["EP", "median MSE"] == np.median(mse)
-    assert set(figures.draw(settings, study_result.data)) == {"forces", "errors", "target", "patient", "peaks"}
-    written = experiment.STUDY.save(study_result, tmp_path)
-    assert all(path.stat().st_size > 0 for path in written) and len(written) == 2 * 3 + 5
-
-
-def test_invalid_settings():
-    with pytest.raises(ValueError, match="--methods must include 'EP'"):
-        experiment.ConstrainedSettings(methods=("smoother", "full information"))
-    assert catalogue.experiment("constrained").study is experiment.STUDY
-
-
 @pytest.mark.slow
 def test_the_rate_of_the_first_window_is_where_the_dense_cost_is_least():
     times, y = problem.TIMES[:61], problem.record("half sines", 303).y
@@ -198,27 +104,3 @@ def test_the_rate_of_the_first_window_is_where_the_dense_cost_is_least():
     assert rate == pytest.approx(best.x, rel=0.02) and cost(rate) == pytest.approx(best.fun, abs=1e-4)
     costs = estimators._compile_costs("window")(np.log(np.sqrt(3.0) / np.array([rate])), y)
     assert float(costs[0]) == pytest.approx(cost(rate), abs=1e-5)
-
-
-@pytest.mark.slow
-def test_a_window_starts_from_the_earlier_estimate():
-    """Rows of the source's estimator equal separate solutions of windows from the printed arrival means."""
-    y = problem.record("half sines", 0).y
-    path = np.asarray(estimators.horizon(jnp.array([1.0]), y))
-    times = problem.TIMES[:61]
-    for begin in (0, 1, 31, 700, 1440):
-        mean = path[begin] if begin else np.zeros(3)
-        window = lfm.full_information(problem.companion(1.0, mean), times, y[begin: begin + 61],
-                                      lower={"factor": 0.0}, grid=times).state_mean
-        np.testing.assert_allclose(path[begin + 30], window[30], atol=1e-4)
-    assert path[:, 1].min() >= 0.0
-
-
-@pytest.mark.slow
-def test_quick_version(tmp_path):
-    """The bounds of the experiment, on few records; the estimates are feasible to the last bit."""
-    study_result = experiment.STUDY.run(experiment.ConstrainedSettings.quick(), tmp_path)
-    assert len(experiment.STUDY.save(study_result, tmp_path)) == 11
-    assert study_result.tables["transcription"].loc[["full information", "EP"], "least"].min() >= 0.0
-    assert study_result.tables["transcription"].loc["full information", "largest MSE"] < 0.0103
-    assert study_result.tables["transcription"]["failed"].sum() == 0

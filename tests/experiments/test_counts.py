@@ -67,18 +67,7 @@ def test_tables_measure_against_the_reference(monkeypatch):
     exact = tables["accuracy"].frame.loc["student-t, reference"]
     assert exact["log Z se"] == 0.01 and exact["seconds"] == 3.0
     assert exact[["less reference", "less reference se", "mean", "sd"]].isna().all()
-
-
-def test_sites_that_did_not_converge_show_and_shorter_data_do_not(monkeypatch):
-    """Both are NaN: a problem with four rows is padded to the six rows of another."""
-    settings, results = synthetic_results(monkeypatch)
-    results["student-t/laplace"] |= {"mean": np.array([0.0, np.nan, 0.2, 0.0])}
-    data = dict(experiment.STUDY.collect(settings, results))
-    data["comparison"] = data["comparison"].pad(dataset=(0, 2))
-    table = experiment.tables(settings, data)["accuracy"].frame
-    assert np.isnan(table.loc["student-t, Laplace", "mean"]) and table.loc["student-t, Laplace", "covered"] == 0.5
-    assert table.loc["student-t, EP", ["mean", "covered"]].tolist() == pytest.approx([0.2, 0.75])
-    assert len(figures.plot_errors(settings, data).axes) == 3
+    assert len(figures.plot_errors(settings, experiment.STUDY.collect(settings, results)).axes) == 3
 
 
 @pytest.mark.slow

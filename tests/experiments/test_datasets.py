@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lfm_ppl.experiments.datasets import TaskKind, cell, row, select_prefix
+from lfm_ppl.experiments.datasets import TaskKind, row
 from lfm_ppl.experiments.scores import Estimate, estimate_mean, estimate_rate
 from lfm_ppl.parallel.task import Task
 
@@ -52,15 +52,6 @@ def test_what_a_cell_lacks_is_missing():
     assert "k" not in kind.collect(tasks[:1], {"EKF": {"rmse": 1.0}})
 
 
-def test_what_is_no_number_is_filled_up_as_well():
-    dataset = collect([*blocks("EKF", (0, 1)), *blocks("CKF", (0, 0))], {"dataset": "held"})
-    assert dataset["held"].sel(rule="EKF").values.tolist() == [1.0, 0.0] and np.isnan(dataset["held"].values[1, 1])
-    tasks = [Task(rule, 0, {"rule": rule, "index": 0}) for rule in ("EKF", "CKF")]
-    kind = TaskKind(block_result, {"": "why, k"}, ("rule",))
-    dataset = kind.collect(tasks, {"EKF": {"why": "a gap"}, "CKF": {"k": 1.0}})
-    assert dataset["why"].values.tolist() == ["a gap", ""]
-
-
 def test_an_entry_that_some_tasks_of_a_cell_lack_is_an_error():
     tasks = [Task(f"EKF/{index}", 0, {"rule": "EKF", "index": index}) for index in range(2)]
     for lacking in ("EKF/0", "EKF/1"):
@@ -79,11 +70,6 @@ def test_several_settings_become_dimensions():
     assert np.isnan(dataset["rmse"].sel(store="two", rule="EKF")).all()
     single = TaskKind(block_result, {"dataset": "rmse"}).collect(tasks[:1], results)
     assert single["rmse"].sizes == {"dataset": 1}
-
-
-def test_a_part_has_the_names_without_what_they_begin_with():
-    dataset = xr.Dataset({"filter_rmse": 1.0, "filter_sd": 2.0, "filters": 3.0, "smoother_rmse": 4.0})
-    assert {name: value.item() for name, value in select_prefix(dataset, "filter").items()} == {"rmse": 1.0, "sd": 2.0}
 
 
 def test_a_row_has_means_shares_and_numbers():
@@ -108,9 +94,3 @@ def test_a_name_stands_for_a_column_of_each_entry():
     assert row(dataset.sel(path="v"), {"RMSE {path}": "rmse"})["RMSE v"] == 20.0
     levels = xr.Dataset({"share": ("level", [0.4, 0.9])}, {"level": [0.5, 0.95]})
     assert row(levels, {"coverage {level:.0%}": "share"}) == {"coverage 50%": 0.4, "coverage 95%": 0.9}
-
-
-def test_a_value_of_no_data_set_stands_alone():
-    assert cell("k", xr.DataArray(2.0)) == {"k": 2.0}
-    with pytest.raises(TypeError):
-        cell("paths", xr.DataArray([1.0, 2.0], dims="path"))

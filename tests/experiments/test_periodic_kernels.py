@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.periodic_kernels import experiment, figures, methods, problem
+from lfm_ppl.experiments.periodic_kernels import experiment, methods, problem
 from lfm_ppl.parallel.task import Task
 
 SMALL = experiment.PeriodicKernelSettings(runs=20, functions=(5, 22), draws=20, points=(20, 200))
@@ -57,23 +56,3 @@ def test_prediction_is_conditioning():
     precision = np.linalg.inv(joint)
     assert variance[40] == pytest.approx(1.0 / precision[-1, -1], rel=1e-5)
     assert mean[40] == pytest.approx(-precision[-1, :-1] @ data / precision[-1, -1], rel=1e-5)
-
-
-def test_settings_are_checked():
-    with pytest.raises(ValueError, match="at most 200"):
-        experiment.PeriodicKernelSettings(functions=(500,))
-    assert experiment.PeriodicKernelSettings.quick(runs=3).runs == 3
-
-
-@pytest.mark.slow
-def test_files_and_figures(results, tmp_path):
-    written = {path.name for path in experiment.STUDY.save(results, tmp_path)}
-    expected = {f"{name}.{kind}" for name in ("covariance", "published", "regression") for kind in ("csv", "md")}
-    assert written == expected | {f"{name}.png" for name in
-                                  ("errors", "covariances", "eigenfunctions", "draws", "prediction")}
-    assert len(figures.plot_errors(SMALL, results.data).axes) == len(problem.kernels())
-
-
-def test_catalogue_has_the_study():
-    assert catalogue.experiment("periodic_kernels").name == "periodic-kernels"
-    assert [task.settings["what"] for task in experiment.all_tasks(SMALL)].count("covariance") == 6

@@ -81,12 +81,6 @@ def test_means_leave_out_what_is_missing():
     assert np.isnan(scores.estimate_mean([5.0]).error)
 
 
-def test_estimates_show_as_many_digits_as_the_error_leaves():
-    assert str(scores.Estimate(0.91234, 0.0312)) == "0.912 (0.031)"
-    assert str(scores.Estimate(12.3, 4.0)) == "12.3 (4.0)"
-    assert str(scores.Estimate(float("nan"), 1.0)) == "-"
-
-
 def test_errors_and_coverage():
     assert scores.rmse([1.0, 3.0], [0.0, 0.0]) == pytest.approx(np.sqrt(5.0))
     assert scores.interval_coverage([0.0, 0.0], [1.0, 1.0], [0.5, 2.0]) == 0.5
@@ -104,3 +98,11 @@ def test_the_error_of_a_standard_deviation_follows_from_the_fourth_moment():
     expected = np.sqrt(np.array([6.0, 3.0, 3.0]) - 1) / np.sqrt(4 * np.array([20_000, 20_000, 5_000]))
     np.testing.assert_allclose(errors, expected, rtol=0.12)
     assert np.isnan(scores.relative_errors_of_sd(np.ones((1, 2, 50)))).all()
+
+
+def test_the_law_of_total_variance():
+    generator = np.random.default_rng(0)
+    mean, variance = generator.normal(size=(3, 2)), generator.uniform(1.0, 2.0, (3, 2))
+    total, sd = scores.total_moments(mean, variance)
+    np.testing.assert_allclose(total, mean.mean(axis=0))
+    np.testing.assert_allclose(sd**2, (variance + mean**2).mean(axis=0) - total**2, rtol=1e-12)

@@ -1,13 +1,12 @@
 """A study as a declaration: what its settings refuse, and what a run of it leaves."""
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from lfm_ppl.experiments import drawing, published, study, timing
+from lfm_ppl.experiments import drawing, published, study
 from lfm_ppl.experiments.datasets import TaskKind, row
 from lfm_ppl.experiments.scores import Estimate
 from lfm_ppl.experiments.study import Study, StudyTable, setting
@@ -83,15 +82,6 @@ def test_a_run_computes_tabulates_and_draws_and_goes_on(tmp_path):
         STUDY.run(ExampleSettings.quick(runs=4, seed=1), tmp_path)
 
 
-def test_what_is_checked_first_is_told_before_anything_is_computed(tmp_path):
-    def check(settings, report):
-        raise FileNotFoundError("there are no data")
-
-    with pytest.raises(FileNotFoundError, match="no data"):
-        dataclasses.replace(STUDY, check=check).run(ExampleSettings(), tmp_path)
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_quick_version_keeps_what_is_given():
     assert ExampleSettings.quick() == ExampleSettings(runs=2, counts=(2,), size=2j)
     assert ExampleSettings.quick(runs=7, seed=3) == ExampleSettings(runs=7, counts=(2,), size=2j, seed=3)
@@ -105,38 +95,13 @@ def test_the_options_are_the_fields_with_the_seed_last():
     assert options["most"] is int and options["names"] == tuple[str, ...]
 
 
-@pytest.mark.parametrize("wrong, message", [
-    ({"runs": 0}, "runs must be at least 1"), ({"runs": 101}, "one seed has 100 data sets; use several seeds"),
-    ({"left_out": -1}, "left_out must be at least 0"), ({"scale": 0.0}, "scale must be finite and greater than zero"),
-    ({"kind": "od"}, "Did you mean 'odd'"), ({"most": 0}, "most must be at least 1"),
-    ({"names": ()}, "names must be a tuple of different labels"), ({"names": "ab"}, "a tuple of different labels"),
-    ({"names": ("a", "a")}, "a tuple of different labels"), ({"names": ("d",)}, "unknown names 'd'"),
-    ({"counts": (3, 1)}, "increasing numbers"), ({"counts": (0, 1)}, "counts must be at least 1"),
-    ({"nuts": (2, 10)}, "nuts must be chains, warm-up and draws"), ({"nuts": (2, 0, 1)}, "nuts: warm-up must be"),
-    ({"seed": -1}, "seed must be at least 0")])
-def test_settings_say_what_is_wrong(wrong, message):
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize("wrong", [
+    {"runs": 0}, {"runs": 101}, {"runs": 2.5}, {"left_out": -1}, {"scale": 0.0}, {"kind": "od"}, {"most": 0},
+    {"names": ()}, {"names": "ab"}, {"names": ("a", "a")}, {"names": ("d",)}, {"counts": (3, 1)}, {"counts": (1.5,)},
+    {"nuts": (2, 10)}, {"nuts": (2, 0, 1)}, {"seed": -1}], ids=str)
+def test_settings_say_what_is_wrong(wrong):
+    with pytest.raises((TypeError, ValueError), match="data sets" if wrong == {"runs": 101} else next(iter(wrong))):
         ExampleSettings(**wrong)
-
-
-@pytest.mark.parametrize("wrong", [{"runs": 2.5}, {"runs": "2"}, {"left_out": 0.5}, {"counts": (1.5,)}])
-def test_what_is_no_whole_number_is_refused(wrong):
-    with pytest.raises(TypeError, match="must be a whole number"):
-        ExampleSettings(**wrong)
-
-
-def test_what_is_compiled_at_the_first_call_is_not_timed():
-    calls = []
-    for label in ("a test", "another test", "a test"):
-        calls.append(label)
-        seconds, value = timing.time_compiled_call(label, lambda: calls.append("called") or len(calls))
-        assert seconds >= 0.0 and value == len(calls)
-    assert calls == ["a test", "called", "called", "another test", "called", "called", "a test", "called"]
-
-
-def test_a_legend_has_each_label_once():
-    (legend,) = plot().legends
-    assert [text.get_text() for text in legend.get_texts()] == ["95% band", "truth", "estimate", "more", "area"]
 
 
 def test_published_errors_have_errors_of_their_own():
