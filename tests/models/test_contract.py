@@ -1,6 +1,5 @@
 """What every model file owes: its names, its data, its documentation, and a finite density."""
 
-import functools
 import itertools
 import re
 from dataclasses import replace
@@ -19,39 +18,20 @@ from lfm_ppl.io.data import read_csv, write_csv
 from lfm_ppl.io.data_set import Data
 
 MODELS = sorted(loading.available())
+COSTLY = ("gps", "home-heating", "ballistic-3d", "epidemic", "thyroid")
+"""Models that take long to compile; what others show as well is run with -m slow."""
 
 
 def choices(name):
-    """Return every combination of the choices that a model offers, as keyword arguments."""
-    options = loading.load(name).options
-    listed = {key: accepted for key, (_, accepted, _) in options.items() if type(accepted) is tuple}
+    """Return every combination of the choices that a model offers, as keyword arguments, the default first."""
+    listed = {key: (default, *(value for value in accepted if value != default))
+              for key, (default, accepted, _) in loading.load(name).options.items() if type(accepted) is tuple}
     return [dict(zip(listed, values, strict=True)) for values in itertools.product(*listed.values())]
 
 
-COSTLY = ("gps", "home-heating", "ballistic-3d", "epidemic")
-"""Models whose other variants take long to compile; these are run with -m slow."""
-
-ALL_BUT_GPS = [pytest.param(name, marks=[pytest.mark.slow] if name == "gps" else []) for name in MODELS]
-
-CASES = [
-    pytest.param(name, options, id="-".join([name, *map(str, options.values())]),
-                 marks=[pytest.mark.slow] if name in COSTLY and (name == "gps" or options != choices(name)[0]) else [])
-    for name in MODELS
-    for options in choices(name)
-]
-
-
-@functools.cache
-def simulated(name, *options):
-    """Return the default data of a model, simulated once for all tests."""
-    return loading.load(name).simulate(**dict(options))
-
-
-def sites(file, data, options):
-    """Return the trace of one run of the model."""
-    keywords = file.keywords(data, options)
-    seeded = numpyro.handlers.seed(file.model, jax.random.key(0))
-    return numpyro.handlers.trace(seeded).get_trace(data.times, data.y, **keywords)
+CASES = [pytest.param(name, options, id="-".join([name, *map(str, options.values())]),
+                      marks=[pytest.mark.slow] if name == "gps" or options != choices(name)[0] else [])
+         for name in MODELS for options in choices(name)]
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -68,85 +48,51 @@ def test_documentation(name):
 
 
 @pytest.mark.parametrize(("name", "options"), CASES)
-def test_default_data_fit_the_model_and_carry_their_truth(name, options):
-    file = loading.load(name)
-    data = simulated(name, *options.items())
-    assert isinstance(data, Data)
-    assert file.outputs is None or data.outputs == file.outputs
-    check_observations(data.y, len(data.times), len(data.outputs))
-    truth = data.truth
-    assert set(file.parameters) <= set(truth["parameters"])
-    assert np.asarray(truth["state"]).shape[0] == len(truth["times"])
-    assert all(np.shape(force) == np.shape(truth["times"]) for force in truth["forces"].values())
-    assert set(data.times) <= set(np.asarray(truth["times"])), "the truth is known at the data"
-
-
-@pytest.mark.parametrize("name", ALL_BUT_GPS)
-def test_default_data_depend_on_the_seed_alone(name):
-    file = loading.load(name)
-    first = file.simulate(seed=123)
-    np.testing.assert_array_equal(file.simulate(seed=123).y, first.y)
-    assert not np.array_equal(first.y, simulated(name).y)
-
-
-@pytest.mark.parametrize(("name", "options"), CASES)
-def test_sites_are_those_that_the_file_documents(name, options):
-    file = loading.load(name)
-    data = simulated(name, *options.items())
-    result = sites(file, data, options)
-    sampled = [key for key, site in result.items() if site["type"] == "sample" and not site["is_observed"]]
-    assert sampled == list(file.parameters)
-    for key in sampled:
-        value = np.asarray(data.truth["parameters"][key])
-        assert value.shape == result[key]["fn"].shape(), key
-        assert np.all(result[key]["fn"].support(value)), f"the true {key} is possible"
-
-
-@pytest.mark.parametrize(("name", "options"), CASES)
-def test_the_density_at_the_truth_is_finite_and_near_its_best(name, options):
+def test_the_truth_of_the_default_data_is_possible_and_near_the_best(name, options):
     """A true parameter explains its data: not 30 nats worse than halved or doubled ones."""
     file = loading.load(name)
-    data = simulated(name, *options.items())
-    keywords = file.keywords(data, options)
-
-    @jax.jit
-    def density(values):
-        return log_density(file.model, (data.times, data.y), keywords, values)[0]
-
-    truth = {key: np.asarray(data.truth["parameters"][key], float) for key in file.parameters}
-    best = float(density(truth))
-    assert np.isfinite(best)
-    for factor in (0.5, 2.0):
-        others = {key: value * factor for key, value in truth.items()}
-        assert best > float(density(others)) - 30.0
+    data = file.simulate(**options)
+    keywords, parameters = file.keywords(data, options), data.truth["parameters"]
+    check_observations(data.y, len(data.times), len(data.outputs))
+    assert file.outputs is None or data.outputs == file.outputs
+    assert np.asarray(data.truth["state"]).shape[0] == len(data.truth["times"])
+    assert all(np.shape(force) == np.shape(data.truth["times"]) for force in data.truth["forces"].values())
+    assert set(data.times) <= set(np.asarray(data.truth["times"])), "the truth is known at the data"
+    seeded = numpyro.handlers.seed(file.model, jax.random.key(0))
+    trace = numpyro.handlers.trace(seeded).get_trace(data.times, data.y, **keywords)
+    sampled = [key for key, site in trace.items() if site["type"] == "sample" and not site["is_observed"]]
+    assert sampled == list(file.parameters)
+    for key in sampled:
+        assert np.shape(parameters[key]) == trace[key]["fn"].shape(), key
+        assert np.all(trace[key]["fn"].support(np.asarray(parameters[key]))), f"the true {key} is possible"
+    density = jax.jit(lambda values: log_density(file.model, (data.times, data.y), keywords, values)[0])
+    truth = {key: np.asarray(parameters[key], float) for key in file.parameters}
+    best, *others = (float(density({key: value * factor for key, value in truth.items()})) for factor in (1, 0.5, 2))
+    assert np.isfinite(best) and best > max(others) - 30.0
 
 
 @pytest.mark.parametrize("name", [
     pytest.param(name, marks=[pytest.mark.slow] if name in COSTLY else []) for name in MODELS])
-def test_prior_predictive_has_the_shape_of_the_data(name):
+def test_draws_of_the_prior_have_the_shape_of_the_data(name):
     file = loading.load(name)
-    data = simulated(name)
-    predictive = Predictive(file.model, num_samples=3)
-    draws = predictive(jax.random.key(1), data.times, **file.keywords(data, {}))
-    assert draws["y"].shape == (3, *data.y.shape)
-    assert np.all(np.isfinite(draws["y"]))
+    data = file.simulate()
+    draws = Predictive(file.model, num_samples=3)(jax.random.key(1), data.times, **file.keywords(data, {}))
+    assert draws["y"].shape == (3, *data.y.shape) and np.all(np.isfinite(draws["y"]))
 
 
-@pytest.mark.parametrize("name", ALL_BUT_GPS)
-def test_default_data_survive_a_file(name, tmp_path):
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=[pytest.mark.slow] if name == "gps" else []) for name in MODELS])
+def test_default_data_depend_on_the_seed_alone_and_survive_a_file_and_other_units(name, tmp_path):
     file = loading.load(name)
-    data = simulated(name)
+    data = file.simulate(seed=123)
+    np.testing.assert_array_equal(file.simulate(seed=123).y, data.y)
+    assert not np.array_equal(file.simulate(seed=124).y, data.y)
     write_csv(data, tmp_path / "data.csv")
     prepared = file.prepare(read_csv(tmp_path / "data.csv", file.outputs, inputs=file.inputs))
-    assert prepared.outputs == data.outputs
-    assert np.all(np.isnan(prepared.y) == np.isnan(data.y))
+    assert prepared.outputs == data.outputs and isinstance(data, Data)
+    np.testing.assert_array_equal(np.isnan(prepared.y), np.isnan(data.y))
     if not prepared.note:
         np.testing.assert_array_equal(prepared.y, data.y)
-
-
-@pytest.mark.parametrize("name", ALL_BUT_GPS)
-def test_units_of_the_data_reach_the_model(name):
-    file = loading.load(name)
-    data = replace(simulated(name), units={**file.units, "time": "fortnight"})
+    data = replace(data, units={**file.units, "time": "fortnight"})
     site = likelihood_site(file.model, (data.times, data.y), file.keywords(data, {}), jax.random.key(0))
     assert site.example.ssm.model.units["time"] == "fortnight"

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_map import Transcribed
 
 import lfm_ppl as lfm
 from lfm_ppl.io import loading
@@ -76,47 +75,3 @@ def test_four_steps_between_samples_are_exact(scale):
     system = own.build(7.0, scale, 1.5, 0.03)
     few, many = (lfm.MarginalLikelihood(system, data.times, steps=steps).log_prob(data.y) for steps in (4, 16))
     assert few == pytest.approx(float(many), abs=0.01)
-
-
-@pytest.mark.slow
-def test_full_information_against_ipopt():
-    """In shares of the steady state; TRH is bounded where it matters, and the states are non-negative."""
-    own = module()
-    data = loading.load("thyroid").simulate(seed=3)
-    times, y = data.times[:13], data.y[:13]
-    level, scale, lengthscale, variation = 7.0, 3.0, 1.5, 0.03
-    model = own.build(level, scale, lengthscale, variation)
-    names = (*model.state_names, "TRH")
-    bounds = dict.fromkeys(names, 0.0) | {"TRH": 7.5}
-    result = lfm.full_information(model, times, y, lower=bounds, grid=times, steps=32, tolerance=1e-10)
-    assert result.converged
-
-    def drift(x, u):
-        trh = (u + level) * 1e-9
-        t4, t3, t3c, tsh = (x[k] * own.STEADY[k] for k in range(4))
-        ft4 = t4 * 1e-9 / own.BOUND_T4
-        t3n = t3c * 1e-9 / own.BOUND_T3N
-        th = own.G_T * tsh / (tsh + own.D_T)
-        q = th * tsh / (tsh + own.SHUNT)
-        made = (own.G_D1 * (ft4 / (ft4 + own.K_M1) + q / (q + own.K_M1)) + own.G_T3 * tsh / (tsh + own.D_T)
-                + own.G_D2 * (ft4 / (ft4 + own.K_M2) + q / (q + own.K_M2)))
-        c = own.A_S2 * own.G_H / own.B_S2 * trh / (trh + own.D_H) / (1 + own.L_S * t3n / (t3n + own.D_R))
-        z = (c - own.D_S + ((own.D_S - c) ** 2 + 4 * (1 + own.S_S) * c * own.D_S) ** 0.5) / (2 * (1 + own.S_S))
-        rates = (own.A_T * th * 1e9 - own.B_T * t4, own.A_31 * made * 1e9 - own.B_31 * t3,
-                 own.A_32 * own.G_D2 * 1e9 * ft4 / (ft4 + own.K_M2) - own.B_32 * t3c,
-                 own.A_S * own.B_S2 / own.A_S2 * z - own.B_S * tsh)
-        return [3600.0 * rate / steady for rate, steady in zip(rates, own.STEADY, strict=True)]
-
-    reference = Transcribed(
-        drift, lambda x: [x[3] * own.STEADY[3], x[1] * own.FREE[1], x[0] * own.FREE[2]], (scale, lengthscale, 1),
-        np.zeros((4, 4)), np.ones(4), np.diag((own.START_SD / own.STEADY) ** 2), (variation * own.FREE) ** 2,
-        [(4, 1.0, 7.5 - level), *((k, 1.0, 0.0) for k in range(4))])
-    # From the steady state and the prior mean of TRH, and not from our own solution.
-    guess = np.tile([1.0, 1.0, 1.0, 1.0, 0.0, 0.0], (len(times), 1))
-    nodes, objective = reference.solve(times, np.asarray(y), guess, rounds=8)
-    assert float(result.objective) == pytest.approx(objective, abs=1e-4)
-    np.testing.assert_allclose(np.asarray(result.force("TRH")) - level, nodes[:, 4], atol=1e-3)
-    # Its bounds are met to 1e-8; TRH moves by nmol/l between rows.
-    at_bound = nodes[:, :5] - [0.0, 0.0, 0.0, 0.0, 7.5 - level] < 1e-5
-    np.testing.assert_array_equal(np.asarray(result.active), at_bound)
-    assert at_bound[:, 4].any() and not at_bound.all(axis=0).any() and not at_bound[:, :4].any()

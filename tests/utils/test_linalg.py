@@ -41,8 +41,7 @@ def test_products(shapes):
     assert np.array_equal(square, np.swapaxes(square, -1, -2))
 
 
-@pytest.mark.parametrize("shapes", [((3, 4), (4, 4)), ((5, 2, 3), (3, 3)), ((2, 3), (5, 3, 3)), ((9, 12), (12, 12)),
-                                    ((0, 2), (2, 2))])
+@pytest.mark.parametrize("shapes", [((3, 4), (4, 4)), ((5, 2, 3), (3, 3)), ((2, 3), (5, 3, 3)), ((0, 2), (2, 2))])
 def test_derivatives_of_products(shapes):
     """In both modes, of second order too, and beside a constant: as those of A P A' by the product rule."""
     rng = np.random.default_rng(3)
@@ -88,7 +87,7 @@ def test_derivatives_of_a_congruence_off_symmetry():
         np.testing.assert_allclose(*mixed, atol=1e-12)
 
 
-@pytest.mark.parametrize("size", [1, 2, 5, 9])
+@pytest.mark.parametrize("size", [1, 2, 9])
 def test_cholesky_and_triangular_solves(size):
     p, b = definite(size), np.random.default_rng(1).normal(size=(size, 3))
     factor = cholesky(jnp.asarray(p))
