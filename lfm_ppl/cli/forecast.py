@@ -40,9 +40,6 @@ MORE_FIGURES = {"inputs": "forecast-inputs.png", "forces": "forecast-forces.png"
 
 SCORES = "scores.csv"
 
-_GRID = 121
-"""Number of times of a forecast with --until: enough for smooth bands."""
-
 
 def run(result: str, options: ForecastOptions, line: Sequence[str]) -> int:
     """Write the forecast into the result, as a table and as a figure, with scores for held-out data."""
@@ -74,7 +71,7 @@ def run(result: str, options: ForecastOptions, line: Sequence[str]) -> int:
 
 def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) -> tuple[Any, pd.DataFrame | None]:
     """Return the forecast with the held-out data, and their scores; None without any."""
-    times = requested_times(task.observed, options.times, _GRID)
+    times = requested_times(task.observed, options.times)
     known_inputs = {}
     if held_out is not None:
         times = np.union1d(times, held_out.times)

@@ -245,7 +245,7 @@ class Times:
     """Times of predictions."""
 
     until: Annotated[Text, Parameter(metavar="TIME")] | None = None
-    """predict new data, with their noise, up to this time, a number or a date"""
+    """predict new data, with their noise, up to this time, a number or a date, at the median spacing of the data"""
     at: Annotated[Text, Parameter(metavar="T1,T2,...")] | None = None
     """times or dates at which new data are predicted, between or after the observations"""
 

@@ -11,17 +11,20 @@ from lfm_ppl.utils import calendar_time
 _TRAJECTORY_TIMES = 241
 """Number of times of the trajectories between the first and the last one: enough for a smooth line."""
 
+_MOST_FORECAST_TIMES = 1000
+"""Largest number of times between the last observation and --until."""
+
 
 def trajectory_times(observed: Data, requests: Times) -> np.ndarray | None:
     """Return the times of the trajectories; None without --until and --at, for the library's grid."""
     if requests == Times():
         return None
-    times = np.union1d(observed.times, requested_times(observed, requests, 2))
+    times = np.union1d(observed.times, requested_times(observed, requests))
     return np.union1d(np.linspace(observed.times[0], times[-1], _TRAJECTORY_TIMES), times)
 
 
-def requested_times(observed: Data, requests: Times, grid: int) -> np.ndarray:
-    """Return the times of --at and the ``grid`` times to --until, sorted.
+def requested_times(observed: Data, requests: Times) -> np.ndarray:
+    """Return the times of --at, and times at the median spacing of the data up to --until, sorted.
 
     Raises:
         ValueError: neither a number nor a date; --until is not after the last observation.
@@ -36,7 +39,12 @@ def requested_times(observed: Data, requests: Times, grid: int) -> np.ndarray:
         last_time = f"{last:g}" if observed.origin is None else calendar_time.clock(
             last, observed.origin, observed.units["time"], "T")
         raise ValueError(f"--until takes a time after the last observation, at {last_time}, got {requests.until}.")
-    return np.union1d(times, np.linspace(last, end, grid))
+    gaps = np.diff(observed.times)
+    spacing = np.median(gaps[gaps > 0]) if (gaps > 0).any() else end - last
+    spacing *= np.ceil((end - last) / spacing / _MOST_FORECAST_TIMES)
+    # An end that is a multiple of the spacing up to rounding is no second time.
+    later = last + spacing * np.arange(1, np.floor((end - last) / spacing * (1 - 1e-9)) + 1)
+    return np.union1d(times, [*later, end])
 
 
 def _parse_time(flag: str, text: str, observed: Data) -> float:

@@ -38,6 +38,7 @@ def test_a_forecast_writes_table_figures_group_and_scores(run, fitted, tmp_path)
     page = (ahead / "report.html").read_text()
     assert f"lfm-ppl forecast {fitted} --held-out" in page and page.count("data:image/png;base64,") == 2
     assert run(f"forecast {ahead} --until 8 --draws 30 --overwrite")[0] == 0
+    assert pd.read_csv(ahead / "forecast.csv")["time"].tolist() == [6.0, 7.0, 8.0]  # at the spacing of the data
     assert "held_out_data" not in arviz_data.groups(arviz_data.load(ahead))
 
 
