@@ -72,8 +72,8 @@ def check_likelihood(result: Any, log_likelihood: np.ndarray, draw_index: np.nda
     """
     if not arviz_data.has_group(result, "one_step_ahead"):
         return
-    recorded = arviz_data.group(result, "one_step_ahead")["log_density"].transpose("chain", "draw", ...)
-    recorded = recorded.isel(draw=draw_index).values.reshape(*log_likelihood.shape, -1).sum(axis=-1)
+    terms = arviz_data.group(result, "one_step_ahead")["log_density"].transpose("chain", "draw", ...)
+    recorded = terms.isel(draw=draw_index).values.reshape(*log_likelihood.shape, -1).sum(axis=-1)
     difference = np.abs(recorded - log_likelihood)
     if np.any(difference > _TOLERANCE * (1.0 + np.abs(recorded))):
         raise ValueError(f"the model gives other log likelihoods than the result records, by up to {difference.max():g}"

@@ -39,14 +39,15 @@ def format_number(value: Any, digits: int = 3) -> str:
         return "-"
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (float, np.floating)) or not math.isfinite(value):
         return str(value)
-    if value == 0.0:
+    number = float(value)
+    if number == 0.0:
         return "0"
-    scientific = f"{value:.{digits - 1}e}"
-    if not 1e-4 <= abs(float(value)) < 1e6:
+    scientific = f"{number:.{digits - 1}e}"
+    if not 1e-4 <= abs(number) < 1e6:
         return scientific
     # 9.999 has its leading digit at 1 before it is rounded, and at 10 afterwards.
     exponent = int(scientific.partition("e")[2])
-    return f"{value:.{max(digits - 1 - exponent, 0)}f}"
+    return f"{number:.{max(digits - 1 - exponent, 0)}f}"
 
 
 def readable(frame: pd.DataFrame, digits: int = 3) -> pd.DataFrame:
