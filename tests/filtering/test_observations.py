@@ -62,25 +62,22 @@ def test_covariance_that_depends_on_the_state(rule, points):
     assert np.isclose(result.filtered_mean[0, 0], 0.2 + 0.3 / s * 0.5, rtol=1e-10)
 
 
-def test_angles_are_compared_on_the_circle():
+@pytest.mark.parametrize("turns", [-2, 0, 3])
+def test_angles_are_compared_on_the_circle(turns):
     """Whole turns of the data change nothing, in the residual and beyond."""
-    plain, angular = (lfm.LatentForceModel(
-        *ONE, lfm.GaussianObservation(first_state, jnp.array([0.1]), angular=outputs), PRIOR, initial_time=0.0)
-        for outputs in ((), (0,)))
-    expected = lfm.filter(plain, TIMES, Y)
-    for turns in (-2, 0, 3):
-        turned = lfm.filter(angular, TIMES, Y + 2 * np.pi * turns)
-        assert np.allclose(expected.log_likelihood, turned.log_likelihood, rtol=1e-10)
-        assert np.allclose(expected.filtered_mean, turned.filtered_mean, atol=1e-12)
+    model = lambda angular: lfm.LatentForceModel(  # noqa: E731
+        *ONE, lfm.GaussianObservation(first_state, jnp.array([0.1]), angular=angular), PRIOR, initial_time=0.0)
+    plain = lfm.filter(model(()), TIMES, Y)
+    turned = lfm.filter(model((0,)), TIMES, Y + 2 * np.pi * turns)
+    assert np.allclose(plain.log_likelihood, turned.log_likelihood, rtol=1e-10)
+    assert np.allclose(plain.filtered_mean, turned.filtered_mean, atol=1e-12)
 
 
 def bearing(x, u, t):
     return jnp.arctan2(x[1:], x[:1])
 
 
-@pytest.mark.parametrize("rule", [
-    pytest.param(rule, marks=() if isinstance(rule, lfm.Taylor) else pytest.mark.slow)
-    for rule in RULES], ids=lambda rule: rule.name)
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_angles_are_averaged_on_the_circle(rule):
     """A bearing next to the branch cut at pi, and the same picture turned by half a circle."""
 
@@ -145,10 +142,9 @@ def test_jumps(link):
         assert np.abs(alone.predicted_covariance[0, 1:, 1:] - stationary).max() < 1e-10
 
 
-@pytest.mark.slow
 def test_iterations_change_nothing_on_a_linear_model():
     model = motif(identity, genes=1)
-    plain, iterated = (lfm.smooth(model, TIMES, Y, iterations=n) for n in (0, 2))
+    plain, iterated = (lfm.smooth(model, TIMES, Y, at=[0.0, 1.5, 4.0], iterations=n) for n in (0, 2))
     for name in ("mean", "covariance", "log_likelihood", "leave_one_out"):
         assert np.allclose(getattr(plain, name), getattr(iterated, name), atol=1e-9), name
     assert iterated.change < 1e-9 and np.isnan(plain.change)
@@ -186,7 +182,6 @@ def test_iterations_find_the_posterior_linearisation_of_dense_algebra():
     assert np.isclose(result.log_likelihood.sum(), log_likelihood, rtol=1e-7)
 
 
-@pytest.mark.slow
 def test_iterations_that_go_back_and_forth_meet():
     """With a fixed share of 0.7 or 1 they change for ever, by 1.5 and 3.4 standard deviations."""
     model, times = double_well(mean=0.0, variance=1.0, dispersion=1.0), np.arange(2.0, 18.0, 2.0)
@@ -231,3 +226,14 @@ def test_trajectories_have_the_joint_posterior(draws):
     variance_of_entry = (expected**2 + np.outer(sd, sd) ** 2) / count
     z = (np.cov(flat.T) - expected) / np.sqrt(variance_of_entry)
     assert np.abs(z).max() < 4.5
+
+
+def test_double_well_trajectories_are_marginally_the_smoother():
+    model = double_well()
+    result = lfm.smooth(model, TIMES, Y, at=[0.0, 0.5, 2.5])
+    sample = result.sample(jax.random.key(1), 2000)
+    assert sample.state.shape == (2000, 3, 1) and sample.forces == {}
+    z = (sample.state[:, :, 0].mean(0) - result.state("x0").mean) / (result.state("x0").sd / np.sqrt(2000))
+    assert np.abs(z).max() < 4.5
+    ratio = sample.state[:, :, 0].var(0) / result.state("x0").sd ** 2
+    assert np.abs(ratio - 1).max() < 4.5 * np.sqrt(2 / 2000)

@@ -83,7 +83,6 @@ def test_a_kernel_that_is_not_stationary_drives_a_state():
     assert abs(float(result.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-5
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rule", RULES)
 def test_every_rule_is_exact_where_nothing_is_curved(rule):
     """The rate depends on time, so that no rule may take the exact transition."""
@@ -111,6 +110,14 @@ def test_iterations_across_jumps_converge_with_the_steps():
 
 
 @pytest.mark.slow
+def test_asking_for_times_changes_nothing():
+    one = model(lfm.QuasiPeriodic(kernel(), forces.SQM(0.5, POINTS), functions=1), link)
+    plain, asked = lfm.smooth(one, TIMES, Y, steps=4), lfm.smooth(one, TIMES, Y, steps=4, at=np.append(AT, TIMES))
+    np.testing.assert_allclose(asked.log_likelihood, plain.log_likelihood, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(asked.mean)[len(AT):], plain.mean, atol=1e-8)
+
+
+@pytest.mark.slow
 def test_a_panel_is_a_loop():
     def build(p):
         return model(lfm.QuasiPeriodic(kernel(p["lengthscale"], p["period"]), forces.SQM(2.0, POINTS), functions=3))
@@ -123,7 +130,6 @@ def test_a_panel_is_a_loop():
     np.testing.assert_allclose(result, each, rtol=1e-10)
 
 
-@pytest.mark.slow
 def test_gradients_of_the_likelihood_are_finite_differences():
     """By scale, lengthscale, period and the weights' lengthscale."""
 
@@ -160,7 +166,7 @@ def test_forces_on_a_grid_may_jump():
 
 def test_a_period_longer_than_the_data_is_an_error():
     late = model(lfm.Periodic(kernel(period=24.0), functions=3) + lfm.Constant(1.0))
-    with pytest.raises(ValueError, match="'u'.* 24"):
+    with pytest.raises(ValueError, match="force 'u' has a period of 24, longer than the data, which span 7.4"):
         lfm.MarginalLikelihood(late, TIMES)
 
 
