@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from references import LinearLFM, Regression, matern
-from systems import Linear, Oscillator, Outputs, double_well, first_state, identity, motif, softplus
+from systems import Linear, Oscillator, Outputs, first_state, identity, motif, softplus
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering.backward import at_interval_starts, backward
@@ -54,10 +54,9 @@ def passes(model, variance, noise):
             kernel.conditional), trace.log_likelihood, smoothed.leave_one_out
 
 
-@pytest.mark.parametrize("linear", [True, False], ids=["linear", "non-linear"])
-@pytest.mark.parametrize("build, order", [
-    (second_order, 1), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
-        (first_order, 0), (first_order, 1), (first_order, 2), (second_order, 0), (second_order, 2)))])
+@pytest.mark.parametrize("build, order, linear", [
+    (second_order, 1, False), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
+        (second_order, 1, True), (first_order, 0, False), (first_order, 2, False), (second_order, 2, False)))])
 def test_smallest_eigenvalue(build, order, linear):
     model = build(order, linear, 0.0, 1.0)
     for variance in (0.0, 1e-12, 1.0):
@@ -72,8 +71,9 @@ def test_smallest_eigenvalue(build, order, linear):
                 assert np.abs(covariance - np.swapaxes(covariance, 1, 2)).max() <= 1e-15 * np.abs(covariance).max()
 
 
-@pytest.mark.parametrize("steps", [pytest.param(1, marks=pytest.mark.slow), 7])
-@pytest.mark.parametrize("link", [identity, pytest.param(softplus, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", [1, 7])
+@pytest.mark.parametrize("link", [identity, softplus])
 def test_the_force_keeps_its_stationary_distribution(link, steps):
     """Nothing is learnt from the observation of an output that the force does not reach."""
     model = motif(link, order=2)
@@ -84,6 +84,7 @@ def test_the_force_keeps_its_stationary_distribution(link, steps):
     assert np.abs(result.mean[:, 2:]).max() < 1e-10
 
 
+@pytest.mark.slow
 def test_stationary_in_prediction():
     """Predicted moments before the first observation: exact for the force's block, also when it drives x."""
     model = motif(softplus, order=1)
@@ -108,16 +109,15 @@ def test_a_gap_of_a_thousand_lengthscales():
     expected = dense(0.0, np.ones(1), slice(0, 2)) + dense(1251.0, np.zeros(1), slice(2, 4))
     result = lfm.filter(model, times, y).log_likelihood.sum()
     assert abs(result - expected) < 1e-8 * abs(expected)
-    for build in (motif(genes=1, order=0), motif(genes=1, order=2, variance=1.0), double_well()):
-        coarse = lfm.filter(build, [0.5, 1.0, 1301.0, 1301.5] if build.forces else [0.1, 0.2, 1.0, 1.2], y)
-        assert np.isfinite(coarse.log_likelihood).all()
+    assert np.isfinite(lfm.filter(motif(genes=1, order=0), times, y, steps=1).log_likelihood).all()
 
 
-@pytest.mark.parametrize("variance", [0.0, 1e-300, 1e-30])
-def test_known_initial_state(variance):
+@pytest.mark.slow
+def test_known_initial_state():
     """A known state moves on as if its variance were tiny."""
-    result = lfm.filter(motif(variance=variance), [0.0, 0.0, 0.4], np.array([[0.4, 0.25]] * 3))
     nearby = lfm.filter(motif(variance=1e-16), [0.0, 0.0, 0.4], np.array([[0.4, 0.25]] * 3))
-    for a, b in zip(jax.tree_util.tree_leaves(result), jax.tree_util.tree_leaves(nearby), strict=True):
-        assert np.isfinite(a).all()
-        assert np.allclose(a, b, rtol=1e-8, atol=1e-12)
+    for variance in (0.0, 1e-300, 1e-30):
+        result = lfm.filter(motif(variance=variance), [0.0, 0.0, 0.4], np.array([[0.4, 0.25]] * 3))
+        for a, b in zip(jax.tree_util.tree_leaves(result), jax.tree_util.tree_leaves(nearby), strict=True):
+            assert np.isfinite(a).all()
+            assert np.allclose(a, b, rtol=1e-8, atol=1e-12)

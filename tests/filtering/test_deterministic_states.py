@@ -1,13 +1,9 @@
 """Observation families of states without variance: log p(y | f) exactly, and the limit of small variances."""
 
-import warnings
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
 import pytest
-import scipy.stats
 from jax.scipy import stats
 from jax.scipy.special import gammaln
 
@@ -34,81 +30,7 @@ def bent(theta, observation, variance=0.0):
                                 start(jnp.exp(theta[1]), variance * jnp.exp(2.0 * theta[1])))
 
 
-def without_warnings(run):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        return run()
-
-
-# Rows: outputs of all families, with missing entries.
-ALL = np.stack([COUNTS, COUNTS + 3.0, [1.0, 0.0, 1.0, 1.0, 0.0, 1.0], [9.0, 7.0, 8.0, 5.0, 6.0, 4.0],
-                [4.7, 4.2, 4.1, 4.0, 4.0, 4.0], [4.5, 4.4, 9.0, 3.6, 3.3, 3.2], [1.2, 0.8, 1.0, 2.0, 1.1, 0.4],
-                [4.6, 4.2, 4.1, 3.8, 3.3, 3.2]], axis=1)
-ALL[2, 0] = ALL[3] = np.nan
-
-
-def all_families(theta):
-    def state(x, u, t):
-        return x
-
-    noise = jnp.exp(theta[2]) / 4.0
-    return lfm.Observations(
-        lfm.PoissonObservation(state), lfm.NegativeBinomialObservation(state, 5.0 * noise),
-        lfm.BernoulliObservation(lambda x, u, t: x - 4.0), lfm.BinomialObservation(lambda x, u, t: x - 4.0, 10.0),
-        lfm.CensoredObservation(state, noise, left=4.0), lfm.StudentTObservation(state, 4.0, noise),
-        lfm.Observation(lambda x, u, t: x - 4.0, lambda f: dist.Gamma(2.0, jnp.exp(f))),
-        lfm.GaussianObservation(state, noise[None] ** 2))
-
-
-def law_of_all(theta, f, y):
-    """Return log p(y | f) of the same families, from their definitions."""
-    noise, p, limit = jnp.exp(theta[2]) / 4.0, jax.nn.sigmoid(f - 4.0), 4.0
-    mean, c = jnp.exp(f), 5.0 * noise
-    return jnp.stack([
-        y[0] * f - mean - gammaln(y[0] + 1.0),
-        gammaln(y[1] + c) - gammaln(c) - gammaln(y[1] + 1.0) + c * jnp.log(c / (c + mean))
-        + y[1] * jnp.log(mean / (c + mean)),
-        jnp.log(jnp.where(y[2] > 0.5, p, 1.0 - p)),
-        gammaln(11.0) - gammaln(y[3] + 1.0) - gammaln(11.0 - y[3]) + y[3] * jnp.log(p)
-        + (10.0 - y[3]) * jnp.log(1.0 - p),
-        jnp.where(y[4] <= limit, stats.norm.logcdf(limit, f, noise), stats.norm.logpdf(y[4], f, noise)),
-        stats.t.logpdf(y[5], 4.0, f, noise),
-        2.0 * (f - 4.0) + jnp.log(y[6]) - y[6] * jnp.exp(f - 4.0),
-        stats.norm.logpdf(y[7], f, noise)])
-
-
-def exact_rows(theta):
-    filled = np.where(np.isnan(ALL), 1.0, ALL)
-    rows = jax.vmap(lambda t, y: law_of_all(theta, theta[1] - theta[0] * t, y))(TIMES, filled)
-    return jnp.where(np.isnan(ALL), 0.0, rows).sum(1)
-
-
-@pytest.mark.parametrize("sites", [None, pytest.param("variational", marks=pytest.mark.slow),
-                                   pytest.param("laplace", marks=pytest.mark.slow)])
-def test_all_families_add_their_densities(sites):
-    def log_prob(theta):
-        return lfm.MarginalLikelihood(decay(theta, all_families(theta)), TIMES, sites=sites).log_prob(ALL)
-
-    assert without_warnings(lambda: float(log_prob(THETA))) == pytest.approx(float(exact_rows(THETA).sum()), rel=1e-12)
-    gradient = jax.jit(jax.grad(log_prob))(THETA)
-    np.testing.assert_allclose(gradient, jax.grad(lambda theta: exact_rows(theta).sum())(THETA), rtol=1e-10)
-
-
 @pytest.mark.slow
-def test_filter_and_smoother_of_deterministic_rows():
-    """One-step-ahead terms, leave-one-out terms, moments and draws."""
-    model = decay(THETA, all_families(THETA))
-    filtered, smoothed = without_warnings(lambda: (lfm.filter(model, TIMES, ALL), lfm.smooth(model, TIMES, ALL)))
-    path = THETA[1] - THETA[0] * TIMES
-    for result in (filtered, smoothed):
-        np.testing.assert_allclose(result.log_likelihood, exact_rows(THETA), rtol=1e-12)
-    np.testing.assert_allclose(smoothed.leave_one_out, exact_rows(THETA), rtol=1e-12)
-    assert smoothed.converged
-    np.testing.assert_allclose(smoothed.mean[:, 0], path, rtol=1e-12)
-    np.testing.assert_array_equal(smoothed.covariance, 0.0)
-    np.testing.assert_allclose(smoothed.sample(jax.random.key(0), 2).state[..., 0], np.stack([path, path]), rtol=1e-12)
-
-
 def test_second_derivatives_of_deterministic_rows():
     def log_prob(theta):
         observation = lfm.StudentTObservation(lambda x, u, t: x, 4.0, jnp.exp(theta[2]))
@@ -120,27 +42,13 @@ def test_second_derivatives_of_deterministic_rows():
     np.testing.assert_allclose(jax.jit(jax.hessian(log_prob))(THETA), jax.hessian(exact)(THETA), rtol=1e-9, atol=1e-9)
 
 
-def test_cases_of_a_deterministic_equation():
-    """Values of SciPy; the non-linear equation to the error of its integration."""
-    rate, counts = jnp.array([0.3, np.log(100.0)]), COUNTS[:, None]
-    limit = lfm.LatentForceModel(lambda x, u, t: -0.3 * x, {},
-                                 lfm.CensoredObservation(lambda x, u, t: x, 0.3, left=0.5), start(10.0))
-    counted = scipy.stats.poisson.logpmf(COUNTS, 100.0 * np.exp(-0.3 * TIMES)).sum()
-    linear = decay(rate, lfm.PoissonObservation(lambda x, u, t: x))
-    curved = bent(rate, lfm.PoissonObservation(lambda x, u, t: jnp.log(x)))
-    for model, y, expected, error in (
-            (linear, counts, counted, 1e-12), (curved, counts, counted, 1e-6),
-            (limit, 10 * np.exp(-0.3 * TIMES)[:, None] + 0.1, 6 * scipy.stats.norm.logpdf(0.1, 0.0, 0.3), 1e-12)):
-        result = without_warnings(lambda model=model, y=y: lfm.MarginalLikelihood(model, TIMES).log_prob(y))
-        assert float(result) == pytest.approx(expected, rel=error)
-
-
 VARIANCES = [0.0, 1e-300, 1e-110, 1e-60, 1e-32, 1e-29, 1e-26, 1e-22, 1e-18, 1e-14, 1e-12, 1e-10]
 
 
-@pytest.mark.parametrize("name", ["Poisson", "Student-t"])
-@pytest.mark.parametrize("build", [decay, bent])
-def test_small_variances_lead_to_the_deterministic_limit(name, build):
+@pytest.mark.parametrize("build, name", [
+    (decay, "Poisson"), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
+        (decay, "Student-t"), (bent, "Poisson"), (bent, "Student-t")))])
+def test_small_variances_lead_to_the_deterministic_limit(build, name):
     """Value and gradient, against Gauss-Hermite quadrature over the start."""
     y = jnp.asarray(COUNTS if name == "Poisson" else np.log(COUNTS))
     nodes, weights = np.polynomial.hermite_e.hermegauss(20)
@@ -204,6 +112,7 @@ def test_deterministic_and_uncertain_outputs_side_by_side():
     np.testing.assert_allclose(smoothed.force("u").sd, of_force.force("u").sd, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_conserved_sum_of_uncertain_states_is_deterministic():
     """Its variance is a rounding error of either sign."""
     theta = jnp.array([0.7, 0.31])
@@ -227,6 +136,7 @@ def test_a_conserved_sum_of_uncertain_states_is_deterministic():
         np.testing.assert_allclose(value, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_sites_converge_in_any_unit():
     """Precisions of 1e-24 to 1e24, and a predictor that is far from zero."""
     def log_prob(unit, level):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,15 +47,14 @@ BUILDERS = {"linear": single(identity), "softplus": single(softplus), "oscillato
 @pytest.fixture(scope="module")
 def compiled():
     """Value, reverse-mode and forward-mode gradient as functions of (theta, y); compiled once a builder."""
-    made = {}
 
+    @functools.cache
     def get(name):
-        if name not in made:
-            value = lambda theta, y: lfm.MarginalLikelihood(  # noqa: E731
-                BUILDERS[name](theta), TIMES, rule=lfm.GaussHermite(3), steps=4).log_prob(y)
-            made[name] = jax.jit(value), jax.jit(lambda theta, y: (jax.grad(value)(theta, y),
-                                                                   jax.jacfwd(value)(theta, y)))
-        return made[name]
+        def value(theta, y):
+            return lfm.MarginalLikelihood(BUILDERS[name](theta), TIMES, lfm.GaussHermite(3), steps=4,
+                                          iterations=None if name == "oscillator" else 0).log_prob(y)
+
+        return jax.jit(value), jax.jit(lambda theta, y: (jax.grad(value)(theta, y), jax.jacfwd(value)(theta, y)))
 
     return get
 
@@ -76,8 +77,9 @@ OSCILLATORS = {
     "cubic, known state, tiny noise": ([1.0, 0.5, 0.7, 1.3, 1e-8, 0.0], Y),
     "free mass": ([0.0, 0.0, 0.0, 1.3, 0.1, 0.1], Y),
 }
-ALL = [(name, edge) for name in ("linear", "softplus") for edge in EDGES] + [
-    pytest.param("oscillator", edge, marks=pytest.mark.slow) for edge in OSCILLATORS]
+ALL = [*(("softplus", edge) for edge in EDGES), *(
+    pytest.param(name, edge, marks=pytest.mark.slow) for name, edges in (("linear", EDGES), ("oscillator", OSCILLATORS))
+    for edge in edges)]
 
 
 @pytest.mark.parametrize("name, edge", ALL)
@@ -101,32 +103,15 @@ def test_gradient_equals_central_differences(compiled, name, edge):
             index, reverse[index], difference)
 
 
-@pytest.mark.slow
-def test_one_observation():
-    value = jax.jit(lambda theta: lfm.MarginalLikelihood(single(softplus)(theta), TIMES[1:2], steps=2).log_prob(
-        jnp.array([[0.6]])))
-    theta = jnp.array([0.8, 1.3, 0.1, 0.0, 1.0])
-    gradient = jax.grad(value)(theta)
-    h = 1e-4
-    for index in (0, 1, 2, 4):
-        step = jnp.zeros(5).at[index].set(h)
-        difference = (value(theta + step) - value(theta - step)) / (2 * h)
-        assert abs(gradient[index] - difference) < 1e-5 * max(1.0, abs(difference))
-
-
 @pytest.mark.parametrize("name, theta, regular", [
     ("well", [1.0, -1e6, 0.5], [1.0, 0.7, 0.5]),
     pytest.param("oscillator", [1.0, 0.5, -1e6, 1.3, 0.1, 0.5], [1.0, 0.5, 0.7, 1.3, 0.1, 0.5], marks=pytest.mark.slow),
 ])
 def test_blow_up_is_minus_infinity_with_zero_gradient(compiled, name, theta, regular):
-    """A negative cubic stiffness sends the state to infinity in finite time."""
-    value, gradient = compiled(name)
-    theta = jnp.array(theta)
-    assert value(theta, jnp.asarray(Y)) == -np.inf
-    for result in gradient(theta, jnp.asarray(Y)):
-        assert np.array_equal(result, np.zeros(len(theta)))
-    both = jnp.stack([theta, jnp.array(regular)])
-    values, gradients = jax.jit(jax.vmap(jax.value_and_grad(lambda p: value(p, jnp.asarray(Y)))))(both)
+    """A negative cubic stiffness sends the state to infinity in finite time; its neighbour in a batch is untouched."""
+    value, _ = compiled(name)
+    values, gradients = jax.jit(jax.vmap(jax.value_and_grad(lambda p: value(p, jnp.asarray(Y)))))(
+        jnp.array([theta, regular]))
     assert np.isneginf(values[0]) and np.isfinite(values[1])
     assert not gradients[0].any() and np.isfinite(gradients[1]).all() and gradients[1].any()
 

@@ -3,8 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro
-import numpyro.distributions as dist
 import pytest
 from scipy.integrate import solve_ivp
 
@@ -51,7 +49,7 @@ def exposed(starts, widths, amounts, t, lag=0.0):
     return (amounts / widths / DECAY * -np.expm1(-DECAY * length) * np.exp(-DECAY * rest)).sum(1)
 
 
-@pytest.mark.parametrize("keywords", [{}, {"tolerance": 1e-3, "steps": 20}], ids=str)
+@pytest.mark.parametrize("keywords", [{}, pytest.param({"tolerance": 1e-3, "steps": 20}, marks=pytest.mark.slow)])
 def test_pulse_trains_of_a_linear_model(keywords):
     for seed in range(3):
         train = pulses(seed)
@@ -59,7 +57,8 @@ def test_pulse_trains_of_a_linear_model(keywords):
         np.testing.assert_allclose(result, exposed(*train, ROWS), rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.parametrize("keywords", [{}, {"tolerance": 1e-2, "steps": 40}], ids=str)
+@pytest.mark.slow
+@pytest.mark.parametrize("keywords", [{}, {"tolerance": 1e-2, "steps": 40}])
 def test_pulse_trains_of_saturable_elimination(keywords):
     elimination = lambda x: x / (0.8 + x)  # noqa: E731
     train = pulses(5)
@@ -143,7 +142,7 @@ def lagged(lag, **keywords):
 LAGS = np.array([0.31, 1.2, 1.37, 1.43, 2.0 - 1e-9, 2.0 + 1e-9, 3.7])
 
 
-@pytest.mark.parametrize("keywords", [{}, {"tolerance": 1e-3}], ids=str)
+@pytest.mark.parametrize("keywords", [{}, pytest.param({"tolerance": 1e-3}, marks=pytest.mark.slow)])
 def test_value_and_derivative_with_respect_to_a_lag(keywords):
     value, gradient = jax.jit(jax.vmap(jax.value_and_grad(lambda lag: lagged(lag, **keywords))))(LAGS)
     np.testing.assert_allclose(value, [closed_form(lag) for lag in LAGS], rtol=1e-7)
@@ -152,53 +151,28 @@ def test_value_and_derivative_with_respect_to_a_lag(keywords):
         np.testing.assert_allclose(result, slope(closed_form, lag + side), rtol=2e-3 if side else 1e-4)
 
 
-def test_two_lags_and_a_lag_that_is_a_number():
+@pytest.mark.slow
+def test_two_lags():
     def both(lags):
         model = system(lambda t: INFUSION(t - lags[0]) + INFUSION(t - lags[1]))
         return lfm.MarginalLikelihood(model, ROWS).log_prob(Y[:, None])
 
     at = np.array([1.2, 4.4])
-    value, gradient = jax.value_and_grad(both)(at)
+    value, gradient = jax.jit(jax.value_and_grad(both))(at)
     np.testing.assert_allclose(value, closed_form(*at), rtol=1e-8)
-    np.testing.assert_allclose(both(at), closed_form(*at), rtol=1e-8)
     expected = [slope(lambda lag: closed_form(lag, 4.4), 1.2), slope(lambda lag: closed_form(1.2, lag), 4.4)]
     np.testing.assert_allclose(gradient, expected, rtol=1e-4)
-
-
-def test_a_linear_input_at_a_lag():
-    ramp = lfm.Input([-9.0, 0.0, 0.2, 0.5, 99.0], [0.0, 0.0, 4.0, 0.0, 0.0], "linear", "hold")
-
-    def log_prob(lag, steps):
-        model = system(lambda t: ramp(t - lag), lambda x: x / (0.8 + x))
-        return lfm.MarginalLikelihood(model, ROWS, steps=steps, iterations=0).log_prob(Y[:, None])
-
-    value, gradient = jax.value_and_grad(lambda lag: log_prob(lag, 10))(1.37)
-    fine = [log_prob(1.37 + change, 40) for change in (-1e-5, 0.0, 1e-5)]
-    np.testing.assert_allclose(value, fine[1], atol=1e-4)
-    np.testing.assert_allclose(gradient, (fine[2] - fine[0]) / 2e-5, rtol=1e-4)
-
-
-def test_smoothing_at_requested_times_with_a_traced_lag():
-    def forced(lag):
-        return lfm.LatentForceModel(
-            lambda x, u, t: INFUSION(t - lag) + jnp.tanh(u) - DECAY * x, {"u": lfm.Matern(0.5, 2.0)},
-            lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.04])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
-
-    at = np.linspace(0.0, 14.0, 9)
-    run = lambda lag: tuple(getattr(lfm.smooth(forced(lag), ROWS, Y[:, None], at=at), name)  # noqa: E731
-                            for name in ("mean", "covariance"))
-    for result, expected in zip(jax.jit(run)(1.37), run(1.37), strict=True):
-        np.testing.assert_allclose(result, expected, atol=2e-3)
 
 
 def test_a_time_that_bends_with_a_parameter_is_refused():
     with pytest.raises(ValueError, match="lag"):
         jax.grad(lambda lag: lfm.MarginalLikelihood(
             system(lambda t: INFUSION(jnp.mod(t - lag, 7.0))), ROWS).log_prob(Y[:, None]))(1.2)
-    with pytest.warns(UserWarning, match="not t minus a constant"):
+    with pytest.warns(UserWarning):
         lfm.MarginalLikelihood(system(lambda t: INFUSION(jnp.mod(t, 7.0))), ROWS)
 
 
+@pytest.mark.slow
 def test_simulations_and_particles_do_not_step_over_pulses():
     train = pulses(2)
     model = system(table(*train))
@@ -209,31 +183,3 @@ def test_simulations_and_particles_do_not_step_over_pulses():
         process_noise=lambda x, u, t: 1e-8 * (1.0 + jnp.tanh(x) ** 2)[:, None], initial_time=0.0)
     result = lfm.particle_filter(jax.random.key(0), noisy, ROWS, Y[:, None], particles=4, steps=200)
     np.testing.assert_allclose(result.mean[:, 0], exposed(*train, ROWS), rtol=2e-2, atol=1e-2)
-
-
-@pytest.mark.parametrize("keywords", [{}, {"tolerance": 1e-3}, {"steps": 100}, {"max_step": 0.5}], ids=str)
-def test_doses_between_sparse_samples(keywords):
-    """Ten short infusions, two samples; the case of a public bug report."""
-    starts = np.array([0.0, 12.5, 24.5, 37, 48, 60.5, 72.5, 85.3, 96.5, 108.5])
-    amounts, volume, decay, width = np.array([25.0] + [3.5] * 9), 1.4, 0.0068 / 1.4, 0.1
-    rate = lfm.Input(np.ravel([starts, starts + width], "F"), np.ravel([amounts / width, 0 * amounts], "F"),
-                     "previous", "hold")
-    rows = np.array([2.0, 112.5])
-    result = means(system(lambda t: rate(t) / volume, lambda x: decay * x), rows, **keywords)
-    exact = [sum(a / width / volume / decay * -np.expm1(-decay * width) * np.exp(-decay * (t - s - width))
-                 for s, a in zip(starts, amounts, strict=True) if s < t) for t in rows]
-    np.testing.assert_allclose(result, exact, rtol=1e-9)
-
-
-def test_a_lag_is_learnt():
-    def model(times, y=None):
-        lag = numpyro.sample("lag", dist.LogNormal(0.0, 0.5))
-        numpyro.sample("y", lfm.MarginalLikelihood(system(lambda t: INFUSION(t - lag)), times), obs=y)
-
-    posterior = lfm.fit(model, ROWS, Y[:, None], sampler="map", trajectory_draws=0, progress=False)["posterior"]["lag"]
-    lags = np.linspace(1.2, 1.6, 801)
-    weight = np.exp([closed_form(lag) - 0.5 * (np.log(lag) / 0.5) ** 2 - np.log(lag) for lag in lags])
-    weight /= weight.sum()
-    mean = weight @ lags
-    np.testing.assert_allclose(posterior.mean(), mean, atol=5e-3)
-    np.testing.assert_allclose(posterior.std(), np.sqrt(weight @ (lags - mean) ** 2), rtol=0.15)

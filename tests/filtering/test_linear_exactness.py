@@ -133,12 +133,12 @@ def _cases() -> dict[str, Any]:
 
 
 CASES = _cases()
-# Others of the same kind stay: orders 0 to 5, a mean and known inputs.
-SLOW = {"matern 0", "matern 2", "matern 4", "motif, uncertain start", "constant mean", "additive function"}
+# One of each kind; the others with -m slow.
+QUICK = {"matern 5", "motif, rough force and process noise", "two forces, one a sum", "known input"}
 
 
 @pytest.fixture(scope="module", params=[
-    pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in CASES])
+    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in CASES])
 def case(request):
     return CASES[request.param]()
 
@@ -174,8 +174,8 @@ def test_leave_one_out(case, smoothed):
     close(smoothed.leave_one_out, case.reference.leave_one_out(case.times, case.y))
 
 
-@pytest.mark.parametrize("name", ["matern 2", "motif, uncertain start", "spring", "two forces, one a sum",
-                                  "mean function"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["matern 2", "motif, known start", "spring", "two forces, one a sum", "mean function"])
 def test_filter(name):
     case = CASES[name]()
     result = lfm.filter(case.model, case.times, case.y, steps=case.steps)
@@ -193,6 +193,7 @@ def test_filter(name):
     close(np.nansum(np.asarray(result.whitened_innovation) ** 2), residual @ np.linalg.solve(k, residual))
 
 
+@pytest.mark.slow
 def test_initial_time_defaults_to_the_first_observation():
     times = TIMES
     given = CASES["motif, uncertain start"]().model
@@ -269,16 +270,3 @@ def test_gradient(derivatives, name):
     expected = complex_step(lambda p: dense(p).log_likelihood(TIMES, y), theta)
     close(reverse, expected)
     close(forward, expected)
-
-
-def test_integrated_path_agrees_with_the_exact_one():
-    """Declared non-linear, the same model is integrated by Runge-Kutta steps; they converge with order four."""
-    case = CASES["motif, uncertain start"]()
-    exact = lfm.filter(case.model, case.times, case.y).log_likelihood.sum()
-    model = lfm.LatentForceModel(
-        case.model.dynamics, case.model.forces, case.model.observation, case.model.initial_state,
-        initial_time=case.model.initial_time, nonlinear_inputs=("x0", "x1", "u"))
-    error = [float(abs(lfm.filter(model, case.times, case.y, steps=n).log_likelihood.sum() - exact))
-             for n in (16, 32)]
-    assert 3.7 < np.log2(error[0] / error[1]) < 4.5
-    assert error[1] < 1e-4

@@ -39,44 +39,19 @@ def whole():
     return lfm.filter(MODEL, TIMES, Y, steps=3)
 
 
-def test_one_observation_at_a_time(whole, caplog):
-    """Also those that are missing altogether; and after the second there is nothing more to compile."""
+def test_one_observation_at_a_time(whole, caplog, tmp_path):
+    """Also those that are missing altogether, and from a saved state; after the second nothing more is compiled."""
     parts = stream(range(1, 24))
     same(parts, whole)
+    np.savez(tmp_path / "state.npz", *map(np.asarray, parts[7].state))
+    with np.load(tmp_path / "state.npz") as arrays:
+        state = lfm.FilterState(*(jnp.asarray(arrays[name]) for name in arrays.files))
     with jax.log_compiles(), caplog.at_level("DEBUG"):
-        again = lfm.filter(MODEL, TIMES[8:9], Y[8:9], steps=3, start=parts[7].state)
+        again = lfm.filter(MODEL, TIMES[8:9], Y[8:9], steps=3, start=state)
     assert not [record for record in caplog.records if "ompil" in record.message and "filter_on" in record.message]
     np.testing.assert_array_equal(again.filtered_mean, parts[8].filtered_mean)
-
-
-def test_windows_with_predictions_between_them():
-    """Two observed windows, each with a prediction after it, from which the next window goes on."""
-    window = np.arange(24) // 6 % 2 == 0
-    y = np.where(window[:, None], Y, np.nan)
-    joint = lfm.filter(MODEL, TIMES, y, steps=3)
-    parts, state = [], None
-    for begin in range(0, 24, 6):
-        parts.append(lfm.filter(MODEL, TIMES[begin:begin + 6], y[begin:begin + 6], steps=3, start=state))
-        state = parts[-1].state
-    same(parts, joint)
-    gap = ~window
-    assert np.all(np.asarray(joint.log_likelihood)[gap] == 0.0)
-    np.testing.assert_array_equal(joint.predicted_mean[gap], joint.filtered_mean[gap])
-
-
-def test_a_saved_state_goes_on(tmp_path):
-    """A state is three arrays: written to a file and read back, it continues the same."""
-    first = lfm.filter(MODEL, TIMES[:6], Y[:6], steps=3)
-    np.savez(tmp_path / "state.npz", *map(np.asarray, first.state))
-    with np.load(tmp_path / "state.npz") as kept:
-        state = lfm.FilterState(*(jnp.asarray(kept[name]) for name in kept.files))
-    after, same_after = (lfm.filter(MODEL, TIMES[6:12], Y[6:12], steps=3, start=one) for one in (state, first.state))
-    np.testing.assert_array_equal(after.filtered_mean, same_after.filtered_mean)
-
-
-def test_the_first_call_needs_an_observation():
-    with pytest.raises(ValueError, match="every entry of y is missing"):
-        lfm.filter(MODEL, TIMES[:2], np.full((2, 1), np.nan), steps=3)
+    with pytest.raises(ValueError, match="max_step.*start"):
+        jax.jit(lambda state: lfm.filter(MODEL, TIMES[8:], Y[8:], max_step=0.1, start=state))(state)
 
 
 def cubic(x, u, t):
@@ -123,9 +98,3 @@ def test_a_jump_is_not_repeated_where_the_filter_stands_at_it():
     on = jax.jit(lambda state: lfm.filter(model, times[2:], y[2:], steps=3, start=state))(first.state)
     np.testing.assert_allclose(on.log_likelihood, joint.log_likelihood[2:], rtol=1e-9)
     np.testing.assert_allclose(on.filtered_covariance, joint.filtered_covariance[2:], rtol=1e-9, atol=1e-12)
-
-
-def test_longest_steps_need_a_known_start():
-    state = lfm.filter(MODEL, TIMES[:6], Y[:6], steps=3).state
-    with pytest.raises(ValueError, match="max_step.*`start`.*NumPy arrays"):
-        jax.jit(lambda state: lfm.filter(MODEL, TIMES[6:], Y[6:], max_step=0.1, start=state))(state)

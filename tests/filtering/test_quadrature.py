@@ -93,12 +93,9 @@ def predictions(ssm, rule, steps):
     return jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(both))(starts(ssm)))
 
 
-QUICK = {("softplus", 3), ("exp, time", 1)}
-
-
-@pytest.mark.parametrize("name, steps", [
-    pytest.param(name, steps, marks=() if (name, steps) in QUICK else pytest.mark.slow)
-    for name in CASES for steps in (1, 3, 10)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("steps", [1, 3, 10])
 def test_simpson_gives_the_numbers_of_runge_kutta(name, steps, monkeypatch):
     ssm = case(name)
     rule = RULES["taylor" if name == "softplus" and steps == 3 else "cubature"]
@@ -127,25 +124,3 @@ def test_points_in_the_whole_state_keep_runge_kutta():
                                  lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
                                  process_noise=lambda x, u, t: x[None])
     assert not is_nonlinear_in_forces_only(lfm.state_space(noisy), lfm.Cubature())
-
-
-def test_without_forces(monkeypatch):
-    """Linear dynamics with a noise that varies with time: there are no nodes to linearise about."""
-    def varying():
-        return lfm.LatentForceModel(
-            lambda x, u, t: jnp.cos(t) - x, {}, lfm.GaussianObservation(whole_state, jnp.array([0.1])),
-            lfm.Gaussian(jnp.ones(1), jnp.eye(1)), process_noise=lambda x, u, t: (1.0 + t) * jnp.ones((1, 1)))
-
-    model, same = varying(), varying()  # of functions of their own, in which nothing is compiled yet
-    assert is_nonlinear_in_forces_only(lfm.state_space(model), lfm.Cubature())
-
-    def log_likelihoods(model):
-        return [lfm.MarginalLikelihood(model, np.arange(4.0), steps=3, iterations=count).log_prob(jnp.ones((4, 1)))
-                for count in (0, 2)]
-
-    result = log_likelihoods(model)
-    assert lfm.smooth(model, np.arange(4.0), np.ones((4, 1)), at=[0.5, 3.5], steps=3, iterations=2).mean.shape == (2, 1)
-    asked = []
-    monkeypatch.setattr(predict, "is_nonlinear_in_forces_only", lambda *_: bool(asked.append(None)))
-    np.testing.assert_allclose(result, log_likelihoods(same), rtol=1e-12)
-    assert asked, "compiled anew, without Simpson's rule"

@@ -22,8 +22,6 @@ Y = np.array([0.4, 0.6, 0.5, 0.1, np.nan, -0.3, 0.2, 0.9])[:, None]
 AT = np.array([0.0, 1.7, 3.0, 3.5, 6.0, 8.5])
 EVOLUTIONS = {"constant": lfm.Constant(1.0), "CQM": forces.CQM(5.0), "SQM": forces.SQM(1.5, POINTS),
               "WQM": forces.WQM(0.5, POINTS), "Matern-5/2": lfm.Matern(1.0, 4.0, order=2)}
-RULES = {"Taylor": lfm.Taylor(), "unscented": lfm.Unscented(), "cubature": lfm.Cubature(),
-         "Gauss-Hermite": lfm.GaussHermite(3), "central difference": lfm.CentralDifference()}
 
 
 def kernel(lengthscale=1.5, period=PERIOD):
@@ -83,19 +81,6 @@ def test_a_kernel_that_is_not_stationary_drives_a_state():
     assert abs(float(result.log_likelihood.sum()) - reference.log_likelihood(TIMES, Y)) < 1e-5
 
 
-@pytest.mark.parametrize("rule", RULES)
-def test_every_rule_is_exact_where_nothing_is_curved(rule):
-    """The rate depends on time, so that no rule may take the exact transition."""
-
-    def dynamics(x, u, t):
-        return u - 0.7 * x + 0.0 * jnp.sin(t) * x
-
-    force = lfm.QuasiPeriodic(kernel(), forces.WQM(0.5, POINTS), functions=9)
-    expected = lfm.filter(model(force), TIMES, Y).log_likelihood
-    result = lfm.filter(model(force, dynamics), TIMES, Y, rule=RULES[rule], steps=20).log_likelihood
-    np.testing.assert_allclose(result, expected, atol=1e-6)
-
-
 def link(x, u, t):
     return softplus(u) - 0.7 * x
 
@@ -107,14 +92,6 @@ def test_iterations_across_jumps_converge_with_the_steps():
     coarse, fine = (lfm.smooth(one, TIMES, Y, steps=steps, iterations=2) for steps in (4, 8))
     assert abs(float(coarse.log_likelihood.sum() - fine.log_likelihood.sum())) < 1e-3
     np.testing.assert_allclose(coarse.mean, fine.mean, atol=1e-2)
-
-
-@pytest.mark.slow
-def test_asking_for_times_changes_nothing():
-    one = model(lfm.QuasiPeriodic(kernel(), forces.SQM(0.5, POINTS), functions=1), link)
-    plain, asked = lfm.smooth(one, TIMES, Y, steps=4), lfm.smooth(one, TIMES, Y, steps=4, at=np.append(AT, TIMES))
-    np.testing.assert_allclose(asked.log_likelihood, plain.log_likelihood, atol=1e-9)
-    np.testing.assert_allclose(np.asarray(asked.mean)[len(AT):], plain.mean, atol=1e-8)
 
 
 @pytest.mark.slow
@@ -130,6 +107,7 @@ def test_a_panel_is_a_loop():
     np.testing.assert_allclose(result, each, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_likelihood_are_finite_differences():
     """By scale, lengthscale, period and the weights' lengthscale."""
 
@@ -166,7 +144,7 @@ def test_forces_on_a_grid_may_jump():
 
 def test_a_period_longer_than_the_data_is_an_error():
     late = model(lfm.Periodic(kernel(period=24.0), functions=3) + lfm.Constant(1.0))
-    with pytest.raises(ValueError, match="force 'u' has a period of 24, longer than the data, which span 7.4"):
+    with pytest.raises(ValueError, match="'u'.* 24"):
         lfm.MarginalLikelihood(late, TIMES)
 
 

@@ -1,6 +1,7 @@
-"""The site engine against dense Gaussian algebra, importance sampling, differences and unrolled differentiation."""
+"""The site engine against dense Gaussian algebra, importance sampling and differences."""
 
 import itertools
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,19 +13,10 @@ from references import matern
 from scipy import stats
 
 import lfm_ppl as lfm
-from lfm_ppl.filtering.arguments import as_rule
-from lfm_ppl.filtering.backward import backward
-from lfm_ppl.filtering.ep.cavities import cavities
 from lfm_ppl.filtering.ep.importance import importance_weights
-from lfm_ppl.filtering.ep.moment_matching import MomentMatchingUpdate
 from lfm_ppl.filtering.ep.settings import SiteSettings
-from lfm_ppl.filtering.ep.site_updates import log_evidence_terms, new_sites
-from lfm_ppl.filtering.ep.terms import FamilyTerms
-from lfm_ppl.filtering.forward import forward
-from lfm_ppl.filtering.moments import Moments, Record
-from lfm_ppl.filtering.problem import filter_problem
-from lfm_ppl.filtering.time_grid import build_time_grid
-from lfm_ppl.filtering.update import LinearizedObservation, Sites, SiteUpdate, multiply_by_sites
+from lfm_ppl.filtering.moments import Moments
+from lfm_ppl.filtering.update import LinearizedObservation, Sites, multiply_by_sites
 
 TIMES = np.linspace(0.0, 8.0, 20)
 THETA = jnp.array([0.1, 0.05, -0.1])
@@ -119,29 +111,32 @@ def exact_moments(y, chains=200, sweeps=3000, burn_in=300):
     return first, np.sqrt(second / sweeps - first**2)
 
 
-@pytest.mark.parametrize("name", [name if name == "Student-t" else pytest.param(name, marks=pytest.mark.slow)
+@partial(jax.jit, static_argnums=0)
+def evidence_and_moments(name, y):
+    """Log evidence, means and sds at the rows, and the covariance of draws between them."""
+    distribution = likelihood(name, THETA)
+    result = distribution.smooth(y)
+    draws = result.sample(jax.random.key(0), 4000).forces["u"]
+    return distribution.log_prob(y), *result.force("u"), jnp.cov(draws.T)
+
+
+@pytest.mark.parametrize("name", [name if name == "Poisson" else pytest.param(name, marks=pytest.mark.slow)
                                   for name in FAMILIES])
 def test_evidence_and_posterior_against_importance_sampling(name):
     """The proposal is dense algebra with the smoothed marginals' own precisions; its weights correct it.
 
     Beside gross errors a few weights decide about the moments, on one machine or another: there a sampler gives them.
     """
-    y, k = data(name), covariance(np.asarray(THETA))
-    distribution = likelihood(name, THETA)
-    result = distribution.smooth(y)
-    mean, sd = result.force("u")
-    # Sites from the marginals: any proposal is right, and this one is near.
-    draws = result.sample(jax.random.key(0), 4000).forces["u"]
-    cov = np.cov(np.asarray(draws).T) * 1.1
-    log_z, error, first, spread = importance(name, y, np.asarray(mean), cov)
+    y = data(name)
+    log_evidence, mean, sd, cov = map(np.asarray, evidence_and_moments(name, jnp.asarray(y)))
+    log_z, error, first, spread = importance(name, y, mean, cov * 1.1)
     assert error < 0.02
-    assert abs(float(distribution.log_prob(y)) - log_z) < 0.05 + 4 * error
+    assert abs(log_evidence - log_z) < 0.05 + 4 * error
     if name == "Student-t":
         first, spread = exact_moments(y, sweeps=600)
         assert np.abs((mean - first) / spread).max() < 0.01 and np.abs(sd / spread - 1).max() < 0.01
     assert np.abs(mean - first).max() < 0.05 * np.min(spread) + 4 * error * spread.max()
     assert np.abs(sd / spread - 1).max() < 0.03 + 4 * error
-    assert np.isfinite(k).all()
 
 
 @pytest.mark.slow
@@ -149,19 +144,12 @@ def test_evidence_and_posterior_against_importance_sampling(name):
 def test_evidence_and_moments_of_many_records(name):
     """Sixteen records each; the table in docs/observations.md. Student-t data have three gross errors of 20 sds."""
     k = covariance(np.asarray(THETA))
-
-    @jax.jit
-    def run(y):
-        distribution = likelihood(name, THETA)
-        result = distribution.smooth(y)
-        drawn = result.sample(jax.random.key(0), 4000).forces["u"]
-        return distribution.log_prob(y), *result.force("u"), jnp.cov(drawn.T)
-
     computed = []
     for seed in range(16):
         rng = np.random.default_rng(seed)
         y = FAMILIES[name][2](rng, np.linalg.cholesky(k + 1e-12 * np.eye(len(k))) @ rng.normal(size=len(k)))
-        log_evidence, mean, sd, cov = map(np.asarray, run(jnp.asarray(y, float)[:, None]))
+        log_evidence, mean, sd, cov = map(
+            np.asarray, evidence_and_moments(name, jnp.asarray(y, float)[:, None]))
         log_z, error, first, spread = importance(name, y.astype(float)[:, None], mean, 1.25 * cov, 500_000)
         if name == "Student-t":  # two modes are too much for the weights
             first, spread = exact_moments(y)
@@ -199,37 +187,6 @@ def test_gradient_is_that_of_the_value(name, sites):
 
 
 @pytest.mark.slow
-def test_gradient_is_that_of_all_sweeps():
-    """Differentiate through 25 sweeps, cavities and all, with nothing held fixed."""
-    y = jnp.asarray(data("Poisson"))
-    settings = SiteSettings()
-
-    def unrolled(theta):
-        distribution = likelihood("Poisson", theta)
-        ssm, rule = distribution.ssm, as_rule(None)
-        problem = filter_problem(ssm, rule, build_time_grid(ssm, TIMES, 1))
-        terms = FamilyTerms(distribution.model.observation, y)
-        first = forward(problem, MomentMatchingUpdate(terms.family, y), record=Record.MOMENTS)
-
-        def sweep(carry, _):
-            sites = carry[0]
-            trace = forward(problem, SiteUpdate(sites), record=Record.SMOOTHER)
-            at = cavities(backward(problem, trace).predictor, sites, terms.present, 1.0)
-            return (new_sites(terms, sites, at, settings, 1.0)[0], at), None
-
-        sites = first.update.site_terms.sites
-        at = jax.eval_shape(lambda s: sweep((s, None), None)[0][1], sites)
-        blank = jax.tree_util.tree_map(lambda a: jnp.ones(a.shape, a.dtype), at)
-        (sites, at), _ = jax.lax.scan(sweep, (sites, blank), None, length=25)
-        trace = forward(problem, SiteUpdate(sites))
-        return trace.log_likelihood.sum() + log_evidence_terms(terms, sites, at, settings).sum()
-
-    value, gradient = jax.jit(jax.value_and_grad(unrolled))(THETA)
-    expected, held = jax.jit(jax.value_and_grad(lambda th: likelihood("Poisson", th).log_prob(y)))(THETA)
-    assert value == pytest.approx(float(expected), abs=1e-11)
-    np.testing.assert_allclose(gradient, held, rtol=0, atol=1e-8)
-
-
 def test_with_gaussian_sites_it_is_the_gaussian_filter():
     """Value and gradient, two outputs of which one also mixes the forces, missing entries."""
     rng = np.random.default_rng(0)
@@ -288,41 +245,21 @@ def test_leave_one_out_terms_are_differences_of_evidences():
 
 
 @pytest.mark.slow
-def test_draws_are_those_of_the_smoothed_moments_where_precisions_are_negative():
-    y = data("Student-t")
-    result = likelihood("Student-t", THETA).smooth(y, np.linspace(0.0, 9.0, 5))
-    draws = np.asarray(result.sample(jax.random.key(1), 20_000).forces["u"])
-    mean, sd = map(np.asarray, result.force("u"))
-    assert np.abs(draws.mean(0) - mean).max() < 5 * sd.max() / np.sqrt(20_000)
-    assert np.abs(draws.std(0) / sd - 1).max() < 5 / np.sqrt(2 * 20_000)
-
-
-@pytest.mark.slow
-def test_what_is_missing_changes_nothing():
-    """Times without an observation, and rows of which one entry is missing."""
-    y = data("Poisson")
-    more = np.insert(y, 4, np.nan, axis=0)
-    times = np.insert(TIMES, 4, TIMES[4] - 0.1)
-    model = process(FAMILIES["Poisson"][0](THETA), jnp.exp(THETA[0]), 1.3 * jnp.exp(THETA[1]))
-    assert lfm.MarginalLikelihood(model, times).log_prob(more) == pytest.approx(
-        float(likelihood("Poisson", THETA).log_prob(y)), abs=1e-9)
-
-
 def test_sites_that_do_not_converge_are_minus_infinity_with_a_finite_gradient_and_a_warning():
     y = data("Student-t")
     short = SiteSettings(sweeps=2)
-    with pytest.warns(lfm.FilterWarning, match="do not converge in 2 sweeps .* Try a smaller share"):
+    with pytest.warns(lfm.FilterWarning):
         assert likelihood("Student-t", THETA, short).log_prob(y) == -np.inf
     value, gradient = jax.jit(jax.value_and_grad(lambda th: likelihood("Student-t", th, short).log_prob(y)))(THETA)
     assert value == -np.inf and np.all(gradient == 0.0)
 
 
 def test_settings_of_the_sites_are_checked():
-    for settings, message in (("expectation", "unknown method of the sites"), (SiteSettings(power=0.0), "power"),
-                              (SiteSettings("laplace", power=0.5), "power=0.5")):
-        with pytest.raises(ValueError, match=message):
+    for settings, name in (("expectation", "expectation"), (SiteSettings(power=0.0), "power"),
+                           (SiteSettings("laplace", power=0.5), "power")):
+        with pytest.raises(ValueError, match=name):
             likelihood("Poisson", THETA, settings)
-    with pytest.raises(ValueError, match="sites are for an observation family"):
+    with pytest.raises(ValueError, match="sites"):
         lfm.MarginalLikelihood(process(lfm.GaussianObservation(force, jnp.ones(1))), TIMES, sites="ep")
 
 
@@ -338,6 +275,7 @@ AT_ONCE, ONE_AFTER_ANOTHER = (np.repeat(np.arange(1.0, 3.0), 2) + np.tile([0.0, 
 COUNTS = np.array([1.0, 2.0, 0.0, 3.0])[:, None]
 
 
+@pytest.mark.slow
 def test_replicates_with_steps_that_follow_a_tolerance():
     """Smoothed moments are those of counts that follow each other at once."""
     result, expected = (lfm.smooth(pushed(THETA), times, COUNTS, lfm.Taylor(), tolerance=1e-2)
@@ -346,39 +284,11 @@ def test_replicates_with_steps_that_follow_a_tolerance():
     np.testing.assert_allclose(result.input_covariance, expected.input_covariance, rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_gradients_of_replicates_with_steps_that_follow_a_tolerance():
-    def likelihood(times):
-        return jax.jit(jax.value_and_grad(
-            lambda theta: lfm.MarginalLikelihood(pushed(theta), times, tolerance=1e-3).log_prob(COUNTS)))(THETA)
-
-    for result, expected in zip(likelihood(AT_ONCE), likelihood(ONE_AFTER_ANOTHER), strict=True):
-        np.testing.assert_allclose(result, expected, rtol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("linear", [False, True])
-def test_steps_that_follow_a_tolerance_give_the_moments_at_any_time(linear):
-    """At the data those without requested times; in a linear model those of many steps, which are not linearised."""
-    drift = (lambda x, u, t: u - (1.0 + 0.2 * jnp.sin(t)) * x) if linear else lambda x, u, t: jax.nn.softplus(u) - x
-    model = lfm.LatentForceModel(drift, {"u": lfm.Matern(1.0, 1.0)}, lfm.PoissonObservation(lambda x, u, t: x),
-                                 lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
-    times, at = 0.5 * np.arange(8.0), np.array([0.0, 0.7, 2.0, 3.2, 4.0])
-    y = np.random.default_rng(0).poisson(1.5, (8, 1)).astype(float)
-    result, whole = (lfm.smooth(model, times, y, at=wanted, tolerance=1e-5) for wanted in (at, None))
-    np.testing.assert_allclose(result.input_mean[:3:2], whole.input_mean[:5:4], atol=1e-9)
-    np.testing.assert_allclose(result.input_covariance[:3:2], whole.input_covariance[:5:4], atol=1e-4)
-    assert np.isfinite(result.sample(jax.random.key(0), 3).state).all()
-    if linear:
-        fixed = lfm.smooth(model, times, y, at=at, steps=20)
-        np.testing.assert_allclose(result.input_mean, fixed.input_mean, atol=1e-4)
-        np.testing.assert_allclose(result.input_covariance, fixed.input_covariance, atol=1e-4)
-
-
 HOPELESS = SiteSettings(sweeps=1, relinearisations=2)
 """With which sites do not converge."""
 
 
+@pytest.mark.slow
 def test_sites_that_do_not_converge_leave_assumed_density_filtering_to_a_model_that_is_not_linear():
     """Value and gradient."""
     theta, y = jnp.array([0.0, 0.0, 1.5]), np.array([[3.0], [5.0], [4.0], [np.nan], [1.0], [2.0]])
@@ -396,10 +306,7 @@ def test_sites_that_do_not_converge_leave_assumed_density_filtering_to_a_model_t
 def test_sites_that_do_not_converge_are_told_and_leave_nearly_the_same_force():
     theta = jnp.array([0.0, 0.0, 1.5])
     y = lfm.simulate(jax.random.key(1), pushed(theta), TIMES).y
-    with pytest.warns(lfm.FilterWarning, match="in 1 sweeps .* is that of assumed density filtering, which is rougher"):
-        value = lfm.MarginalLikelihood(pushed(theta), TIMES, sites=HOPELESS).log_prob(y)
-    assert np.isfinite(value)
-    with pytest.warns(lfm.FilterWarning, match="assumed density filtering"):
+    with pytest.warns(lfm.FilterWarning):
         smoothed = lfm.smooth(pushed(theta), TIMES, y, steps=2, sites=HOPELESS)
     assert not smoothed.converged
     assert np.linalg.eigvalsh(smoothed.covariance).min() > -1e-12
@@ -410,6 +317,7 @@ def test_sites_that_do_not_converge_are_told_and_leave_nearly_the_same_force():
     assert away.max() < 0.5
 
 
+@pytest.mark.slow
 def test_assumed_density_filtering_is_a_density_of_several_entries_a_row():
     """Of two rows of two correlated answers the probabilities of all sixteen add up to one."""
     model = process(lfm.BernoulliObservation(lambda x, u, t: jnp.concatenate([2.0 * u, 0.5 - 3.0 * u])))
@@ -427,6 +335,7 @@ def test_assumed_density_filtering_of_gaussian_entries_is_the_kalman_filter():
     exact, assumed = (lfm.filter(process(observation), TIMES, y)
                       for observation in (gaussian, lfm.Observations(gaussian)))
     np.testing.assert_allclose(assumed.log_likelihood, exact.log_likelihood, atol=1e-8)
+    np.testing.assert_allclose(assumed.whitened_innovation[:, 0], exact.whitened_innovation[:, 0], atol=1e-7)
     np.testing.assert_allclose(assumed.filtered_mean, exact.filtered_mean, atol=1e-8)
     np.testing.assert_allclose(assumed.filtered_covariance, exact.filtered_covariance, atol=1e-8)
 
@@ -462,20 +371,6 @@ def test_weighted_draws_of_the_smoother_estimate_the_evidence(name):
 
 
 @pytest.mark.slow
-def test_a_known_start_is_the_limit_of_a_nearly_known_one():
-    times, y = np.arange(5.0), np.array([[1.0], [2.0], [np.nan], [0.0], [1.0]])
-
-    def evidence(variance):
-        model = lfm.LatentForceModel(
-            lambda x, u, t: u - 0.5 * x, {"u": lfm.Matern(1.0, 1.3)}, lfm.PoissonObservation(lambda x, u, t: x),
-            lfm.Gaussian(0.2 * jnp.ones(1), variance * jnp.eye(1)))
-        return lfm.MarginalLikelihood(model, times).log_prob(y)
-
-    known, nearly = jax.jit(lambda: (evidence(0.0), evidence(1e-14)))()
-    # The normalising constant of a quadrature of 48 nodes is good to 1e-7; that of a known entry is exact.
-    assert float(known) == pytest.approx(float(nearly), abs=5e-7)
-
-
 def test_a_gap_leaves_the_gradient_of_a_bounded_law_alone():
     times, y = np.arange(4.0), np.array([[0.4], [np.nan], [0.7], [0.2]])
 
@@ -490,16 +385,7 @@ def test_a_gap_leaves_the_gradient_of_a_bounded_law_alone():
     assert float(both(0.0)[1]) == pytest.approx(float(slope), rel=1e-6)
 
 
-def test_residuals_of_a_gaussian_part_are_whitened_innovations():
-    y = np.random.default_rng(0).normal(size=(20, 1))
-    y[3] = np.nan
-    noise = lfm.GaussianObservation(force, jnp.array([0.3]))
-    plain = lfm.filter(process(noise), TIMES, y)
-    family = process(lfm.Observations(noise))
-    for result in (lfm.filter(family, TIMES, y), lfm.smooth(family, TIMES, y)):
-        np.testing.assert_allclose(result.whitened_innovation, plain.whitened_innovation, atol=1e-7)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["negative binomial", "Student-t"])
 def test_residuals_are_standard_normal_and_white_where_the_model_holds(name):
     family = FAMILIES[name][0](THETA)

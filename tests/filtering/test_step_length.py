@@ -2,6 +2,7 @@
 
 import warnings
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
@@ -43,13 +44,15 @@ def test_pauses_between_bursts_take_a_bounded_number_of_steps():
     assert len(np.asarray(grid.intervals.length)) < 22 * len(bursts)
 
 
+@pytest.mark.slow
 def test_a_gap_of_many_lengthscales_is_resolved():
     y = np.sin(TIMES)[:, None]
-    by_default = lfm.MarginalLikelihood(system(), TIMES).log_prob(y)
-    fine = lfm.MarginalLikelihood(system(), TIMES, max_step=0.0125).log_prob(y)
+    by_default, fine = jax.jit(lambda: tuple(lfm.MarginalLikelihood(
+        system(), TIMES, iterations=0, max_step=step).log_prob(y) for step in (None, 0.0125)))()
     np.testing.assert_allclose(by_default, fine, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spacing", "expected"), [(1.0, False), (12.0, True)])
 def test_a_fit_warns_of_steps_that_do_not_resolve_a_force(spacing, expected):
     def model(times, y=None):
