@@ -11,32 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lfm_ppl.forces import (
-    CQM,
-    SQM,
-    WQM,
-    Constant,
-    Force,
-    Matern,
-    ModeratedPeriodicMatern,
-    Periodic,
-    PeriodicMatern,
-    PeriodicSquaredExponential,
-    QuasiPeriodic,
-    RandomWalk,
-    Resonator,
-    SparseSpectrum,
-    SquaredExponential,
-    WienerVelocity,
-)
+from lfm_ppl.forces import (  # isort: skip
+    CQM, SQM, WQM, Constant, Force, Matern, ModeratedPeriodicMatern, Periodic, PeriodicMatern,
+    PeriodicSquaredExponential, QuasiPeriodic, RandomWalk, Resonator, SparseSpectrum, SquaredExponential,
+    WienerVelocity)
 
 # Functions of (scale, lengthscale). A new force is covered by a line here.
 FORCES = {
     **{f"matern_{p}": lambda s, ell, p=p: Matern(s, ell, order=p) for p in range(6)},
-    **{
-        f"squared_exponential_{n}": lambda s, ell, n=n: SquaredExponential(s, ell, order=n)
-        for n in (2, 4, 6, 7, 8)
-    },
+    **{f"squared_exponential_{n}": lambda s, ell, n=n: SquaredExponential(s, ell, order=n) for n in (2, 4, 6, 7, 8)},
     "wiener_velocity": lambda s, ell: WienerVelocity(s, 0.5 * s, 2.0 * s / ell, mean=0.5),
     "random_walk": lambda s, ell: RandomWalk(s / jnp.sqrt(ell), 0.5 * s),
     "resonator": lambda s, ell: Resonator(10.0 * ell, s, s / jnp.sqrt(ell)),
@@ -62,6 +45,14 @@ FORCES = {
 # Forces whose state-space form has exactly the covariance that they state in closed form.
 EXACT = [name for name in FORCES if not name.startswith(
     ("squared", "oscillator", "jumping", "quasi")) and name not in ("periodic", "periodic_moderated")]
+# Compiled by default, at least one of each kind; the others with -m slow.
+QUICK = ("matern_1", "matern_5", "squared_exponential_6", "wiener_velocity", "random_walk", "damped_resonator",
+         "sparse_spectrum", "constant", "sum", "cqm", "sqm", "wqm", "periodic", "quasi_periodic_steps", "jumping_sum")
+QUICK_DERIVATIVES = ("matern_1", "oscillator")
+
+
+def params(quick):
+    return [pytest.param(name, marks=() if name in quick else pytest.mark.slow) for name in FORCES]
 
 
 class Oscillator(Force):
@@ -107,26 +98,24 @@ def every_force():
     return FORCES
 
 
-@pytest.fixture(params=FORCES)
-def build(request):
-    """Each force in turn, as a function of (scale, lengthscale)."""
-    return FORCES[request.param]
-
-
-@pytest.fixture(params=EXACT)
-def build_exact(request):
-    return FORCES[request.param]
-
-
-def pytest_generate_tests(metafunc):
-    """Ask at collection which forces are stationary: at import XLA would not have the switches of the tests yet."""
-    if "build_stationary" in metafunc.fixturenames:
-        names = [name for name in FORCES if FORCES[name](1.0, 1.0).stationary]
-        metafunc.parametrize("build_stationary", names, indirect=True)
+@pytest.fixture(params=params(QUICK))
+def name(request):
+    return request.param
 
 
 @pytest.fixture
-def build_stationary(request):
+def build(name):
+    """Each force in turn, as a function of (scale, lengthscale)."""
+    return FORCES[name]
+
+
+@pytest.fixture
+def has_exact_covariance(name):
+    return name in EXACT
+
+
+@pytest.fixture(params=params(QUICK_DERIVATIVES))
+def build_to_differentiate(request):
     return FORCES[request.param]
 
 
@@ -140,29 +129,19 @@ def exact_step():
     return _exact_step
 
 
-def _exact_step(feedback, dispersion, dt, digits=150):
-    """Return exp(F dt) and the process noise from their Taylor series in 150-digit arithmetic.
+def _exact_step(feedback, dispersion, dt, digits=80):
+    """Return exp(F dt) and the process noise from their Taylor series in 80-digit arithmetic.
 
-    Q' = F Q + Q F' + L L', so that Q = sum_k M_k dt^(k+1) / (k+1)!, M_0 = L L',
-    M_(k+1) = F M_k + M_k F'. Meant for |F dt| up to about 20.
+    Q' = F Q + Q F' + L L', so that Q = sum_k M_k dt^(k+1) / (k+1)!, M_0 = L L', M_(k+1) = F M_k + M_k F'. Meant for
+    |F dt| up to about 20.
     """
-
-    def exact(matrix):
-        array = np.asarray(matrix, dtype=float)
-        return np.array([Decimal(float(x)) for x in array.ravel()], dtype=object).reshape(
-            array.shape
-        )
-
+    exact = np.vectorize(lambda value: Decimal(float(value)), otypes=[object])
     with localcontext() as context:
         context.prec = digits
-        step = exact(feedback) * Decimal(float(dt))
-        column = exact(dispersion)
-        n = len(step)
-        term, transition = exact(np.eye(n)), exact(np.zeros((n, n)))
-        moment = (
-            column.dot(column.T) * Decimal(float(dt)) if column.size else exact(np.zeros((n, n)))
-        )
-        noise = exact(np.zeros((n, n)))
+        n, dt = len(feedback), Decimal(float(dt))
+        step, zero = exact(feedback) * dt, exact(np.zeros((n, n)))
+        column = exact(dispersion) if np.size(dispersion) else exact(np.zeros((n, 1)))
+        term, transition, moment, noise = exact(np.eye(n)), zero, column.dot(column.T) * dt, zero
         for k in range(1, 1000):
             transition, noise = transition + term, noise + moment
             term = step.dot(term) / k

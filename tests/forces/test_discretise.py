@@ -12,28 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from lfm_ppl.forces.discretise import discretise, discretise_dispersion
 
 step = jax.jit(discretise, static_argnums=3)
-
-
-def chain(n):
-    """n integrators in a row, driven by one Brownian motion: nilpotent."""
-    return np.diag(np.ones(n - 1), 1), np.eye(n)[:, -1:]
-
-
-@pytest.mark.parametrize("n", [1, 2, 3, 5, 8])
-@pytest.mark.parametrize("dt", [1e-8, 0.3, 1.0, 1e6])
-def test_chain_of_integrators(n, dt):
-    feedback, column = chain(n)
-    transition, noise = step(feedback, column @ column.T, dt)
-    back = np.arange(n)[::-1]
-    weight = np.array([factorial(k) for k in back])
-    power = back[:, None] + back + 1
-    expected = dt ** power.astype(float) / power / np.outer(weight, weight)
-    assert_allclose(noise, expected, rtol=1e-13)
-    order = np.arange(n)[None, :] - np.arange(n)[:, None]
-    entries = [[dt**k / factorial(k) if k >= 0 else 0.0 for k in row] for row in order.tolist()]
-    assert_allclose(transition, entries, rtol=1e-13)
-
-
+DTS = np.array([1e-6, 0.1, 1.0, 4.0])
 SYSTEMS = {
     "repeated root": np.array([[-2.0, 1.0, 0.0], [0.0, -2.0, 1.0], [0.0, 0.0, -2.0]]),
     "undamped": np.array([[0.0, 1.0], [-9.0, 0.0]]),
@@ -44,20 +23,37 @@ SYSTEMS = {
 }
 
 
+@pytest.mark.parametrize("n", [1, 3, 8])
+def test_chain_of_integrators(n):
+    """Nilpotent; the last of n integrators in a row is driven by Brownian motion."""
+    feedback, column = np.diag(np.ones(n - 1), 1), np.eye(n)[:, -1:]
+    back, order = np.arange(n)[::-1], np.arange(n)[None, :] - np.arange(n)[:, None]
+    weight = np.array([factorial(k) for k in back])
+    power = back[:, None] + back + 1
+    for dt in (1e-8, 0.3, 1.0, 1e6):
+        transition, noise = step(feedback, column @ column.T, dt)
+        assert_allclose(noise, dt ** power.astype(float) / power / np.outer(weight, weight), rtol=1e-13)
+        entries = [[dt**k / factorial(k) if k >= 0 else 0.0 for k in row] for row in order.tolist()]
+        assert_allclose(transition, entries, rtol=1e-13)
+
+
+@jax.jit
+def both(feedback, column):
+    return jax.vmap(lambda dt: (discretise(feedback, column @ column.T, dt),
+                                discretise_dispersion(feedback, column, dt)))(DTS)
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
-@pytest.mark.parametrize("dt", [1e-6, 0.1, 1.0, 4.0])
-def test_equals_the_taylor_series_in_high_precision(name, dt, exact_step):
+def test_equals_the_taylor_series_in_high_precision(name, exact_step):
     feedback = SYSTEMS[name]
     column = np.linspace(1.0, 0.0, len(feedback))[::-1, None]
-    expected_transition, expected = exact_step(feedback, column, dt)
-    sd = np.sqrt(np.diag(expected))
-    unit = np.outer(sd, sd) if sd.all() else 1.0
-    for transition, noise in (
-        step(feedback, column @ column.T, dt),
-        discretise_dispersion(feedback, column, dt),
-    ):
-        assert_allclose(transition, expected_transition, rtol=1e-12, atol=1e-14)
-        assert_allclose(noise / unit, expected / unit, atol=3e-14)
+    for transitions, noises in both(feedback, column):
+        for dt, transition, noise in zip(DTS, transitions, noises, strict=True):
+            expected_transition, expected = exact_step(feedback, column, dt)
+            sd = np.sqrt(np.diag(expected))
+            unit = np.outer(sd, sd) if sd.all() else 1.0
+            assert_allclose(transition, expected_transition, rtol=1e-12, atol=1e-14)
+            assert_allclose(noise / unit, expected / unit, atol=3e-14)
 
 
 def test_more_states_than_are_unrolled(exact_step):
@@ -70,38 +66,29 @@ def test_more_states_than_are_unrolled(exact_step):
     assert_allclose(noise, expected, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("size", [1e2, 1e5, 1e8])
-def test_stable_systems_forget_without_overflow(size):
-    feedback = np.array([[-1.0, 3.0], [0.0, -1.5]])
-    diffusion = np.array([[2.0, 0.3], [0.3, 1.0]])
-    transition, noise = step(feedback, diffusion, size)
-    assert_allclose(transition, 0.0, atol=1e-30)
-    assert_allclose(feedback @ noise + noise @ feedback.T, -diffusion, atol=1e-13)
-
-
-def test_slow_and_fast_modes_together():
-    transition, noise = step(np.diag([-1e8, -1e-3]), np.eye(2), 1.0)
+def test_stable_systems_forget_without_overflow():
+    feedback, diffusion = np.array([[-1.0, 3.0], [0.0, -1.5]]), np.array([[2.0, 0.3], [0.3, 1.0]])
+    for dt in (1e2, 1e5, 1e8):
+        transition, noise = step(feedback, diffusion, dt)
+        assert_allclose(transition, 0.0, atol=1e-30)
+        assert_allclose(feedback @ noise + noise @ feedback.T, -diffusion, atol=1e-13)
+    transition, noise = step(np.diag([-1e8, -1e-3]), np.eye(2), 1.0)  # slow and fast modes together
     assert_allclose(transition, np.diag([0.0, np.exp(-1e-3)]), atol=1e-7)
     assert_allclose(noise, np.diag([0.5e-8, -np.expm1(-2e-3) / 2e-3]), rtol=1e-7)
 
 
-def test_no_time():
+def test_edges():
+    """No time, no states, single precision; too long a step is NaN and not a wrong number."""
     transition, noise = step(SYSTEMS["repeated root"], np.eye(3), 0.0)
     assert_array_equal(transition, np.eye(3))
     assert_array_equal(noise, np.zeros((3, 3)))
+    assert [result.shape for result in discretise(np.zeros((0, 0)), np.zeros((0, 0)), 1.0)] == [(0, 0), (0, 0)]
+    single = step(jnp.float32([[-1.0]]), jnp.float32([[2.0]]), jnp.float32(0.3))
+    assert all(result.dtype == jnp.float32 for result in single)
+    assert np.isnan(step(-np.eye(2), np.eye(2), 1e3, 5)).all()
 
 
-def test_too_long_a_step_is_nan_and_not_a_wrong_number():
-    transition, noise = step(-np.eye(2), np.eye(2), 1e3, 5)
-    assert np.isnan(transition).all() and np.isnan(noise).all()
-
-
-def test_no_states():
-    transition, noise = discretise(np.zeros((0, 0)), np.zeros((0, 0)), 1.0)
-    assert transition.shape == noise.shape == (0, 0)
-
-
-@pytest.mark.parametrize("name", ["repeated root", "undamped", "unstable", "zero"])
+@pytest.mark.parametrize("name", ["repeated root", "undamped"])
 def test_gradients(name):
     column = jnp.ones((len(SYSTEMS[name]), 1))
 
@@ -125,18 +112,9 @@ def test_gradient_of_a_long_stable_step_is_finite():
 
 
 def test_vmap_equals_loop():
-    dts = jnp.array([0.0, 0.1, 30.0])
-    rates = jnp.array([1.0, 20.0, 0.1])
-
-    def one(rate, dt):
-        return discretise(rate * SYSTEMS["repeated root"], jnp.eye(3), dt)
-
-    batch = jax.jit(jax.vmap(one))(rates, dts)
+    dts, rates = np.array([0.0, 0.1, 30.0]), np.array([1.0, 20.0, 0.1])
+    feedback = rates[:, None, None] * SYSTEMS["repeated root"]
+    batch = jax.jit(jax.vmap(discretise, (0, None, 0)))(feedback, np.eye(3), dts)
     for i in range(3):
-        for got, expected in zip(batch, one(rates[i], dts[i]), strict=True):
-            assert_allclose(got[i], expected, rtol=1e-13, atol=1e-15)
-
-
-def test_single_precision_stays_single():
-    results = discretise(jnp.float32([[-1.0]]), jnp.float32([[2.0]]), jnp.float32(0.3))
-    assert all(result.dtype == jnp.float32 for result in results)
+        for result, expected in zip(batch, step(feedback[i], np.eye(3), dts[i]), strict=True):
+            assert_allclose(result[i], expected, rtol=1e-13, atol=1e-15)

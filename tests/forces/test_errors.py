@@ -5,74 +5,60 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lfm_ppl.forces import Constant, Matern, SquaredExponential, WienerVelocity
+import lfm_ppl as lfm
+from lfm_ppl import forces
+from lfm_ppl.forces import Constant, Matern, SquaredExponential, Sum, WienerVelocity
 
-WITH_LENGTHSCALE = [Matern, SquaredExponential]
-NOT_POSITIVE = [0.0, -1.0, np.nan, np.inf]
-
-
-@pytest.mark.parametrize("value", NOT_POSITIVE)
-@pytest.mark.parametrize(
-    ("make", "argument"),
-    [(make, name) for make in WITH_LENGTHSCALE for name in ("scale", "lengthscale")]
-    + [(WienerVelocity, "scale"), (Constant, "scale")],
-)
-def test_scales_must_be_positive(make, argument, value):
-    good = {"scale": 1.0, "lengthscale": 1.0} if make in WITH_LENGTHSCALE else {"scale": 1.0}
-    with pytest.raises(ValueError, match=f"^{argument} must be finite and greater than zero"):
-        make(**{**good, argument: value})
-
-
-@pytest.mark.parametrize("value", ["long", None, {"a": 1}])
-def test_scales_must_be_numbers(value):
-    with pytest.raises(TypeError, match="lengthscale must be numeric"):
-        Matern(1.0, value)
-
-
-def test_scales_must_be_one_number_even_as_tracers():
-    with pytest.raises(ValueError, match=r"scale must be one number.*\(2,\).*vmap"):
-        Matern(jnp.ones(2), 1.0)
-    with pytest.raises(ValueError, match=r"lengthscale must be one number.*\(3,\)"):
-        jax.jit(lambda ell: Matern(1.0, ell).feedback())(jnp.ones(3))
-
-
-@pytest.mark.parametrize(
-    ("make", "order", "allowed"),
-    [(Matern, -1, "0, 1, 2, 3, 4, 5"), (Matern, 6, "0, 1, 2, 3, 4, 5")]
-    + [(SquaredExponential, order, "2, 4, 6, 7, 8") for order in (0, 3, 10)],
-)
-def test_order_must_be_in_range(make, order, allowed):
-    with pytest.raises(ValueError, match=f"order must be one of {allowed}, got {order}"):
-        make(1.0, 1.0, order=order)
-
-
-@pytest.mark.parametrize("make", WITH_LENGTHSCALE)
-@pytest.mark.parametrize("order", [2.0, "2", True, None])
-def test_order_must_be_a_python_int(make, order):
-    with pytest.raises(TypeError, match="order must be a Python int.*cannot be sampled"):
-        make(1.0, 1.0, order=order)
-
-
-def test_order_cannot_be_traced():
-    with pytest.raises(TypeError, match="order must be a Python int"):
-        jax.jit(lambda order: Matern(1.0, 1.0, order=order).feedback())(2)
-
-
-@pytest.mark.parametrize("argument", ["initial_value_sd", "initial_velocity_sd"])
-def test_initial_deviations_are_not_negative(argument):
-    with pytest.raises(ValueError, match=f"{argument} .*must be >= 0, got -1"):
-        WienerVelocity(1.0, **{argument: -1.0})
-    with pytest.raises(ValueError, match=f"{argument} must be finite"):
-        WienerVelocity(1.0, **{argument: np.nan})
-    assert WienerVelocity(1.0, **{argument: 0.0}).state_dim == 2
+KERNEL = forces.PeriodicSquaredExponential(1.0, 1.0, 10.0)
+VALUES = [
+    *((lambda make=make, name=name, value=value: make(**{"scale": 1.0, "lengthscale": 1.0, name: value}), name)
+      for make in (Matern, SquaredExponential) for name in ("scale", "lengthscale")
+      for value in (0.0, -1.0, np.nan, np.inf)),
+    (lambda: WienerVelocity(-1.0), "scale"),
+    (lambda: Constant(np.nan), "scale"),
+    (lambda: Matern(jnp.ones(2), 1.0), "scale"),
+    (lambda: jax.jit(lambda ell: Matern(1.0, ell).feedback())(jnp.ones(3)), "lengthscale"),
+    (lambda: Matern(1.0, 1.0, order=6), "order"),
+    (lambda: SquaredExponential(1.0, 1.0, order=3), "order"),
+    (lambda: WienerVelocity(1.0, initial_value_sd=-1.0), "initial_value_sd"),
+    (lambda: WienerVelocity(1.0, initial_velocity_sd=np.nan), "initial_velocity_sd"),
+    (lambda: Constant(1.0, mean=np.nan), "mean"),
+    (lambda: Matern(1.0, 1.0, mean=[1.0, 2.0]), "mean"),
+    (lambda: Sum(()), "force"),
+    (lambda: forces.PeriodicMatern(1.0, 1.0, 0.0), "period"),
+    (lambda: forces.PeriodicSquaredExponential(1.0, 0.0, 3.0), "lengthscale"),
+    (lambda: forces.SQM(1.0, (1.0, 3.0, 2.0)), "change_points"),
+    (lambda: forces.WQM(-0.1, ()), "growth"),
+    (lambda: forces.CQM(0.0), "lengthscale"),
+    (lambda: forces.change_points(24.0, 0.0, 20.0), "period"),
+    (lambda: lfm.Periodic(KERNEL, functions=4), "odd"),
+    (lambda: lfm.Periodic(KERNEL, gamma=2.0), "gamma"),
+    (lambda: lfm.Periodic(KERNEL, functions=7, explained_variance=99), "explained_variance"),
+    (lambda: lfm.QuasiPeriodic(KERNEL, Matern(1.0, 1.0, mean=2.0)), "evolution"),
+    (lambda: forces.resonators(forces.ModeratedPeriodicMatern(1.0, 1.0, 5.0)), "'ModeratedPeriodicMatern'"),
+    (lambda: forces.PeriodicKernel(lambda t, s: t - s, 5.0), "symmetric"),
+    (lambda: forces.PeriodicKernel(lambda t, s: jnp.exp(-((t - s) ** 2)), 5.0, stationary=True), "stationary"),
+    (lambda: forces.PeriodicKernel(lambda t, s: 1.0, 5.0), "elementwise"),
+    (lambda: forces.SparseSpectrum(1.0, np.ones((2, 2))), "frequencies"),
+    (lambda: jax.jit(lambda p: lfm.Periodic(forces.PeriodicMatern(1.0, 1.0, p)).eigenvalues())(24.0), "functions"),
+]
+TYPES = [
+    (lambda: Matern(1.0, "long"), "lengthscale"),
+    (lambda: Matern(1.0, None), "lengthscale"),
+    *((lambda make=make, order=order: make(1.0, 1.0, order=order), "order")
+      for make in (Matern, SquaredExponential) for order in (2.0, "2", True, None)),
+    (lambda: jax.jit(lambda order: Matern(1.0, 1.0, order=order).feedback())(2), "order"),
+    (lambda: Constant(1.0, mean="zero"), "mean"),
+    (lambda: Sum((Matern(1.0, 1.0), 2.0)), "2.0"),
+    (lambda: Matern(1.0, 1.0) + 2.0, "operand"),
+    (lambda: lfm.Periodic(Matern(1.0, 1.0)), "kernel"),
+    (lambda: lfm.QuasiPeriodic(KERNEL, 3.0), "evolution"),
+    (lambda: jax.jit(lambda p: forces.change_points(p, 0.0, 50.0))(24.0), "compilation"),
+]
 
 
-@pytest.mark.parametrize("make", [Matern, SquaredExponential, WienerVelocity, Constant])
-def test_the_mean_is_a_number_or_a_function(make):
-    arguments = (1.0, 1.0) if make in WITH_LENGTHSCALE else (1.0,)
-    with pytest.raises(TypeError, match="mean must be numeric"):
-        make(*arguments, mean="zero")
-    with pytest.raises(ValueError, match="mean must be finite"):
-        make(*arguments, mean=np.nan)
-    with pytest.raises(ValueError, match="mean must be one number"):
-        make(*arguments, mean=[1.0, 2.0])
+def test_wrong_arguments_are_named():
+    for error, cases in ((ValueError, VALUES), (TypeError, TYPES)):
+        for make, name in cases:
+            with pytest.raises(error, match=name):
+                make()
