@@ -127,15 +127,14 @@ def test_what_cannot_be_is_minus_infinity_with_finite_derivatives():
 
 def test_settings_that_constraints_do_not_take():
     times = np.arange(3.0)
-    for settings, message in (
-            ({"iterations": 2}, "Leave iterations out"), ({"max_step": 0.1}, "raise steps"),
-            ({"tolerance": 0.1}, "raise steps"), ({"draws": 3}, "must be even"), ({"draws": -2}, "draws"),
-            ({"lower": {"fcator": 0.0}}, "factor"), ({"upper": {"factor": -1.0}}, "nothing between"),
-            ({"constraints": lambda x, u, t: u[0] ** 2 - 1.0}, "not linear"),
-            ({"grid": [0.0, -1.0]}, "increase")):
-        with pytest.raises(ValueError, match=message):
+    for settings, name in (
+            ({"iterations": 2}, "iterations"), ({"max_step": 0.1}, "steps"), ({"tolerance": 0.1}, "steps"),
+            ({"draws": 3}, "draws"), ({"draws": -2}, "draws"), ({"lower": {"fcator": 0.0}}, "'factor'"),
+            ({"upper": {"factor": -1.0}}, "factor"), ({"constraints": lambda x, u, t: u[0] ** 2 - 1.0}, "linear"),
+            ({"grid": [0.0, -1.0]}, "grid")):
+        with pytest.raises(ValueError, match=name):
             lfm.MarginalLikelihood(model(), times, **{"lower": {"factor": 0.0}, **settings})
     counts = lfm.LatentForceModel(Linear(jnp.array([[-0.6]]), jnp.array([[0.25]])), {"u": lfm.Matern(1.0, 1.0)},
                                   lfm.PoissonObservation(whole_state), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
-    with pytest.raises(TypeError, match="takes an lfm.GaussianObservation"):
+    with pytest.raises(TypeError, match="GaussianObservation"):
         lfm.MarginalLikelihood(counts, times, lower={"u": 0.0})
