@@ -1,92 +1,126 @@
-"""The site is whole: what its navigation, its reference and its messages name exists. MkDocs is not needed for it."""
+"""Public names, and what README, CONTRIBUTING and the site say of them; `mkdocs build --strict` checks the links."""
 
-import ast
 import functools
+import inspect
+import os
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 
 import lfm_ppl as lfm
+from lfm_ppl import orbits
+from lfm_ppl.cli import main
+from lfm_ppl.io import loading
+from lfm_ppl.results import calibration
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
-NAVIGATION = re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text("utf-8"), re.MULTILINE)
-REFERENCE = [name for page in sorted((DOCS / "api").glob("*.md"))
-             for name in re.findall(r"^::: lfm_ppl\.(\S+)$", page.read_text("utf-8"), re.MULTILINE)]
-NOTEBOOKS = {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")}
-MESSAGES = [" ".join(quoted.replace("\n> ", " ").removeprefix("> ").split())
-            for quoted in re.findall(r"(?:^> .+\n)+", (DOCS / "errors.md").read_text("utf-8"), re.MULTILINE)]
+README = (ROOT / "README.md").read_text("utf-8")
+DATA = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data"))
 
 
-def page_exists(name: str) -> bool:
-    """Pages of notebooks are made from these when the site is built."""
-    return (DOCS / name).is_file() or name.startswith("gallery/") and Path(name).stem in NOTEBOOKS
-
-
-def test_every_page_of_the_navigation_exists_and_every_page_is_in_it():
-    assert [name for name in NAVIGATION if not page_exists(name)] == []
-    pages = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
-    assert pages | {f"gallery/{name}.md" for name in NOTEBOOKS} == set(NAVIGATION)
-    assert len(NAVIGATION) == len(set(NAVIGATION))
+def public():
+    """Yield (name, function) of every public function, and of every public method of a public class."""
+    for module in (lfm, lfm.forces, orbits, calibration):
+        for name in getattr(module, "__all__", ("calibrate",)):
+            value = getattr(module, name)
+            if inspect.isclass(value) and value.__module__.startswith("lfm_ppl"):
+                yield name, value.__init__
+                yield from ((f"{name}.{method}", function) for method, function
+                            in inspect.getmembers(value, inspect.isfunction) if not method.startswith("_"))
+            elif inspect.isfunction(value):
+                yield name, value
 
 
 def test_every_public_name_stands_in_the_reference_once():
+    reference = [name for page in sorted((DOCS / "api").glob("*.md"))
+                 for name in re.findall(r"^::: lfm_ppl\.(\S+)$", page.read_text("utf-8"), re.MULTILINE)]
     of_modules = {f"{module}.{name}" for module in ("forces", "orbits") for name in getattr(lfm, module).__all__
                   if name not in lfm.__all__}
-    wanted = {*lfm.__all__, *of_modules} - {"data", "forces", "orbits"}
-    missing = [f"::: lfm_ppl.{name}" for name in sorted(wanted - set(REFERENCE))]
+    missing = {*lfm.__all__, *of_modules} - {"data", "forces", "orbits"} - set(reference)
     assert not missing, f"add to a page of docs/api: {missing}"
-    assert len(REFERENCE) == len(set(REFERENCE))
+    assert len(reference) == len(set(reference))
 
 
-def test_the_overview_of_the_reference_names_every_page_of_it_once():
-    """The names on each page are added when the site is built, by docs/_build/overview.py."""
-    overview = (DOCS / "api" / "index.md").read_text("utf-8")
-    pages = re.findall(r"^\*\*\[.+\]\((\w+\.md)\)\*\*$", overview, re.MULTILINE)
-    assert sorted(pages) == sorted({path.name for path in (DOCS / "api").glob("*.md")} - {"index.md"})
+def test_a_random_key_is_the_first_argument():
+    names = {name: [argument for argument in inspect.signature(function).parameters if argument != "self"]
+             for name, function in public()}
+    drawing = {name: arguments for name, arguments in names.items() if {"key", "rng_key"} & set(arguments)}
+    assert {"simulate", "particle_filter", "calibrate", "MarginalLikelihood.sample", "RAM.init"} <= set(drawing)
+    assert [name for name, arguments in drawing.items() if arguments[0] not in ("key", "rng_key")] == []
+    for key in ("model", jax.random.split(jax.random.key(0), 3)):
+        with pytest.raises(TypeError, match="key"):
+            lfm.simulate(key, None, np.zeros(1))
 
 
-@pytest.mark.parametrize("name", [name for name in REFERENCE if name not in lfm.__all__])
-def test_what_else_stands_in_the_reference_exists(name):
-    *modules, last = name.split(".")
-    assert (ROOT / "lfm_ppl").joinpath(*modules).with_suffix(".py").is_file() or hasattr(getattr(lfm, modules[0]), last)
+def test_files_and_names_that_readme_and_contributing_name_exist():
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    folders = re.findall(r"^ {4,6}([\w./]+/?) {2,}", text, re.MULTILINE)
+    paths = set(re.findall(r"`((?:lfm_ppl|tests|docs)/[\w./]*|[A-Z]+\.md)`", text))
+    linked = re.findall(r"\]\(([\w./]+)(?:#[\w-]+)?\)", README)
+    assert len(paths) > 20
+    assert [path for path in {*folders, *paths, *linked}
+            if not (ROOT / path).exists() and not (ROOT / "lfm_ppl" / path).exists()] == []
+    sources = "\n".join((ROOT / path).read_text("utf-8") for path in paths if path.endswith(".py"))
+    assert [name for name in re.findall(r"`([A-Z_]+|_[a-z]+)`", text)
+            if not re.search(rf"^(?:def )?{name}\b", sources, re.MULTILINE)] == []
+    assert set(re.findall(r"lfm-ppl fit ([a-z][a-z-]*)(?=[\s`])", README)) <= set(loading.available())
 
 
-def test_local_links_and_included_files_exist():
-    for page in DOCS.rglob("*.md"):
-        whole = page.read_text("utf-8")
-        text = re.sub(r"^```.*?^```$|`[^`]+`", "", whole, flags=re.MULTILINE | re.DOTALL)
-        snippets = re.findall(r'--8<-- "([^:"]+)', whole)
-        assert all((DOCS / name).is_file() or (ROOT / name).is_file() for name in snippets), page
-        linked = [page.parent / link for link in re.findall(r"\]\(([^)#:]+)[^):]*\)", text)]
-        for path in linked:
-            name = path.resolve().relative_to(DOCS).as_posix()
-            made = re.fullmatch(r"gallery/(.+?)(_\d+\.png|\.md)", name)
-            assert path.is_file() or made and made[1] in NOTEBOOKS, f"{page}: {name}"
+@pytest.mark.slow
+def test_the_example_of_the_readme_runs(monkeypatch):
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    short = functools.partial(lfm.fit, chains=2, warmup=100, samples=100, progress=False)
+    monkeypatch.setattr(lfm, "fit", short)
+    names: dict = {}
+    exec(code, names)
+    assert 0.0 < float(names["result"]["posterior"]["decay"].mean()) < 5.0
+    assert np.all(np.isfinite(names["result"]["trajectories"]["forces"]))
 
 
-@functools.cache
-def literals() -> str:
-    """Return all texts in the library's source, one a line, with a mark for what a message puts in."""
-    result = []
-    for path in (ROOT / "lfm_ppl").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.JoinedStr):
-                parts = [part.value if isinstance(part, ast.Constant) else "\0" for part in node.values]
-                result.append("".join(map(str, parts)))
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                result.append(node.value)
-    return "\n".join(result)
+@pytest.mark.slow
+def test_the_commands_of_the_readme_run_as_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lines = re.findall(r"^    lfm-ppl (.*)$", README, re.MULTILINE)
+    commands = [shlex.split(line, comments=True) for line in lines]
+    assert [command[0] for command in commands] == ["new", "fit", "check", "forecast"]
+    for command in commands:
+        assert main(command) == 0
+        if command[0] == "new":
+            assert main(["simulate", command[1], "--out", "observations.csv"]) == 0
 
 
-def test_messages_are_found():
-    assert len(MESSAGES) > 20
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "file", "output"), [
+    ("house", "house/house_hourly.csv", "Ti"), ("calls", "calls/bank_calls.csv.gz", "log_calls")])
+def test_examples_of_the_page_on_forecasts_print_its_tables(name, file, output):
+    if not (DATA / file).is_file():
+        pytest.skip(f"needs {DATA / file}")
+
+    def numbers(text):
+        rows = re.findall(r"^(.*?\S)((?: +-?\d+(?:\.\d+)?)+)$", text, re.MULTILINE)
+        return {" ".join(label.split()): [float(cell) for cell in cells.split()] for label, cells in rows}
+
+    run = subprocess.run([sys.executable, DOCS / "examples" / f"{name}.py", DATA / file], cwd=ROOT,
+                         capture_output=True, text=True, check=True)
+    page = (DOCS / "forecasts.md").read_text("utf-8")
+    (shown,) = [block for block in re.findall(r"```text\n(.*?)```", page, re.DOTALL) if f" {output} " in block]
+    result, expected = numbers(run.stdout), numbers(shown)
+    assert result.keys() == expected.keys() and len(result) == 4
+    for label, row in expected.items():
+        assert result[label] == pytest.approx(row, abs=0.02), label
+    origins, rmse, _, log_score = result[output]
+    assert origins == 10 and rmse >= 8 and log_score >= 8
 
 
-@pytest.mark.parametrize("message", MESSAGES)
-def test_a_message_of_the_page_of_errors_is_the_code_s(message):
-    parts = [part.strip() for part in message.split("…")]
-    assert any(parts)
-    for part in filter(None, parts):
-        assert part in literals(), part
+@pytest.mark.slow
+def test_the_code_for_numpyro_and_arviz_users_runs():
+    run = subprocess.run([sys.executable, DOCS / "examples" / "numpyro_arviz.py"], cwd=ROOT, capture_output=True,
+                         text=True, check=True)
+    assert "elpd_loo" in run.stdout and "('decay', 'lengthscale')" in run.stdout

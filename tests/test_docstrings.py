@@ -8,24 +8,22 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parent.parent / "lfm_ppl"
 MODULES = sorted(
-    ".".join(("lfm_ppl", *path.relative_to(PACKAGE).with_suffix("").parts))
-    for path in PACKAGE.rglob("*.py")
-    if path.name not in ("__init__.py", "__main__.py") and ">>> " in path.read_text("utf-8")
-)
-
-
-COSTLY = tuple(f"lfm_ppl.{name}" for name in (
-    "backtesting", "conversion", "fokker_planck_grid.fokker_planck", "forecasting", "inference.bound_model",
-    "inference.handlers.on_latent_grid", "inference.handlers.settings", "inference.kernels.elliptical_slice",
-    "inference.kernels.particle_marginal", "latent_grid.laplace", "latent_grid.latent_grid", "orbits.deviations",
-    "results.accuracy", "results.calibration", "switching.rao_blackwellised", "switching.switched_simulation"))
-"""Modules whose examples take several seconds to compile; these are run with -m slow."""
+    ".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in PACKAGE.rglob("*.py")
+    if path.name not in ("__init__.py", "__main__.py") and ">>> " in path.read_text("utf-8"))
+# Modules whose examples take several seconds to compile.
+COSTLY = {
+    "constrained.moving_horizon", "constrained.posterior", "constrained.full_information", "inference.bind",
+    "workflows.fit", "workflows.fit_many",
+    "workflows.backtest", "workflows.to_arviz", "workflows.forecast", "fokker_planck_grid.fokker_planck",
+    "inference.bound_model", "inference.handlers.on_latent_grid", "inference.handlers.settings",
+    "inference.kernels.elliptical_slice", "inference.kernels.particle_marginal", "latent_grid.laplace",
+    "latent_grid.latent_grid", "orbits.deviations", "results.accuracy", "results.calibration",
+    "switching.rao_blackwellised", "switching.switched_simulation"}
 
 
 @pytest.mark.parametrize("name", [
     pytest.param(name, marks=[pytest.mark.slow] if name in COSTLY else []) for name in MODULES])
 def test_examples(name):
-    module = importlib.import_module(name)
+    module = importlib.import_module(f"lfm_ppl.{name}")
     outcome = doctest.testmod(module, optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
-    assert outcome.attempted > 0
-    assert outcome.failed == 0, f"see the output above: {outcome.failed} examples of {name}"
+    assert outcome.attempted > 0 and outcome.failed == 0
