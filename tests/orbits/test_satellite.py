@@ -159,6 +159,7 @@ def test_start_of_an_orbit_from_positions(around):
             orbits.start_near(TIMES, holes)
 
 
+@pytest.mark.slow
 def test_departures_follow_two_orbits_that_differ_a_little(around):
     """The linear model against the difference of two paths, whose start and sunlight differ."""
     first = orbits.Orbit(0.0, START, 100.0, 0.0)

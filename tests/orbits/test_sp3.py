@@ -15,7 +15,6 @@ needs_gps = pytest.mark.skipif(not GPS.is_dir(), reason=f"{GPS} is not there; LF
 
 START = gps_seconds(2019, 4, 7)
 STEP = 21600.0  # four epochs a day
-LINES_OF_HEADER = {"c": 22, "d": 19}
 SATELLITES = ("G05", "G32", "E01")
 COMMENTS = {"c": ["/* A COMMENT", "/*", "/* ", "/*"], "d": ["/* " + "A LONG COMMENT " * 5]}
 
