@@ -7,6 +7,7 @@ import numpy as np
 from lfm_ppl.cli.options import Times
 from lfm_ppl.io.data_set import Data
 from lfm_ppl.utils import calendar_time
+from lfm_ppl.workflows.fit_results import subdivide
 
 _TRAJECTORY_TIMES = 241
 """Number of times of the trajectories between the first and the last one: enough for a smooth line."""
@@ -20,7 +21,7 @@ def trajectory_times(observed: Data, requests: Times) -> np.ndarray | None:
     if requests == Times():
         return None
     times = np.union1d(observed.times, requested_times(observed, requests))
-    return np.union1d(np.linspace(observed.times[0], times[-1], _TRAJECTORY_TIMES), times)
+    return subdivide(times, _TRAJECTORY_TIMES)
 
 
 def requested_times(observed: Data, requests: Times) -> np.ndarray:
