@@ -5,7 +5,7 @@ import warnings
 import pytest
 
 from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.study import options
+from lfm_ppl.experiments.study import option_fields
 
 SMALL = {
     "ginzburg-landau": {"realisations": 1, "conditional": 2}, "home-heating": {"methods": ("SQM", "none"), "homes": 1},
@@ -26,7 +26,7 @@ def test_tasks_have_separate_names_and_known_kinds(name):
     tasks = study.tasks(settings)
     assert tasks and len({task.stem for task in tasks}) == len(tasks)
     assert {study.task_kind(task) for task in tasks} <= set(study.kinds)
-    assert {option.name for option in options(study.settings)} >= set(SMALL[name])
+    assert {field.name for field, _ in option_fields(study.settings)} >= set(SMALL[name])
 
 
 def check_number(name, tables):
