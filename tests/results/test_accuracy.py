@@ -259,7 +259,7 @@ def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     report = check_accuracy(replaced, well, draws=400, progress=False)
     row = report.table.loc["depth"]
     assert report.reliable
-    assert abs(posteriors["exact"][1] - posteriors["wrong"][1]) > 0.15 * posteriors["wrong"][2]
+    assert abs(posteriors["exact"][1] - posteriors["wrong"][1]) > 0.05 * posteriors["wrong"][2]
     assert abs(row["corrected_mean"] - posteriors["exact"][1]) < 3.5 * row["corrected_mean_se"] + 0.01
     assert abs(row["corrected_sd"] / row["sd"] - posteriors["exact"][2] / posteriors["wrong"][2]) \
         < 3.5 * row["sd_ratio_se"] + 0.02

@@ -51,8 +51,8 @@ def converted(mcmc):
 
 def test_a_plain_run_has_the_groups_of_a_fit(mcmc, converted):
     assert set(arviz_data.groups(converted)) == {
-        "posterior", "sample_stats", "log_likelihood", "one_step_ahead", "trajectories", "posterior_predictive",
-        "predictions", "observed_data"}
+        "posterior", "sample_stats", "log_likelihood", "log_prior", "one_step_ahead", "trajectories",
+        "posterior_predictive", "predictions", "observed_data"}
     draws = mcmc.get_samples(group_by_chain=True)
     for name in ("decay", "lengthscale", "noise_sd", "half_life"):
         np.testing.assert_array_equal(group(converted, "posterior")[name], draws[name])
