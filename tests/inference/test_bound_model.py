@@ -162,7 +162,8 @@ def test_a_second_data_set_compiles_nothing(sampler, model):
     np.testing.assert_array_equal(group(result, "observed_data")["y"].values, OTHER)
 
 
-@pytest.mark.parametrize("model", [small, pytest.param(model, marks=pytest.mark.slow)], ids=["small", "non-linear"])
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [small, model], ids=["small", "non-linear"])
 def test_a_step_is_that_of_numpyros_nuts(model):
     bound = lfm.bind(model, TIMES, Y)
     z = bound.unconstrain({"decay": VALUES["decay"]} if model is small else VALUES)

@@ -33,7 +33,7 @@ def model(times, y=None):
     """Linear in its parameter, whose posterior is therefore normal."""
     level = numpyro.sample("level", dist.Normal(0.5, 1.0))
     numpyro.deterministic("twice", 2.0 * level)
-    numpyro.sample("y", lfm.MarginalLikelihood(build(level), times), obs=y)
+    numpyro.sample("y", lfm.MarginalLikelihood(build(level), times, steps=4), obs=y)
 
 
 def chains(kernel, samples=SAMPLES, **options):
@@ -48,7 +48,8 @@ def log_likelihoods(y):
 
 
 @pytest.fixture(scope="module", params=[
-    pytest.param(name, marks=pytest.mark.slow if name == "delayed acceptance" else ()) for name in KERNELS])
+    pytest.param(name, marks=pytest.mark.slow if isinstance(kernel, functools.partial) else ())
+    for name, kernel in KERNELS.items()])
 def sampled(request):
     """Name of the kernel, its MCMC, and draws (chain, draw)."""
     mcmc = chains(request.param)

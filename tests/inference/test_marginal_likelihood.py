@@ -153,9 +153,6 @@ def test_prior_predictive_has_the_exact_moments():
     error = np.abs(white @ white.T / draws - np.eye(len(chol)))
     assert np.diag(error).max() < 4.5 * np.sqrt(2.0 / draws)
     assert error.max() < 5.0 * np.sqrt(2.0 / draws)
-    parameters = {name: jnp.stack([value] * 3)[None] for name, value in THETA.items()}
-    new = Predictive(motif.model, parameters, batch_ndims=2)(jax.random.key(1), TIMES)
-    assert new["y"].shape == (1, 3, len(TIMES), 2) and np.all(np.isfinite(new["y"]))
 
 
 @pytest.mark.slow

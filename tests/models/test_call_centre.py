@@ -65,6 +65,7 @@ def test_every_force_has_the_covariance_that_is_said(force, variance):
     assert len(result.jump_times) == (3 if force == "wqm" else 0)
 
 
+@pytest.mark.slow
 def test_steps_of_two_minutes_are_short_enough():
     m, data = own(), loading.load("call-centre").simulate()
     values = {name: m.TRUTH[name] for name in m.names("matern")}

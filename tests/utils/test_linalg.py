@@ -173,7 +173,7 @@ def derivatives(factorise, keep, root, live, weights, floor):
     return value(z), grad(z), jax.jacfwd(value)(z), jax.hessian(value)(z), jax.vmap(grad)(jnp.stack([z, -z]))
 
 
-@pytest.mark.parametrize("keep", [True, False])
+@pytest.mark.parametrize("keep", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("floor", [[0.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 2.0], [0.3, 0.3, 0.3, 0.3]])
 @pytest.mark.parametrize("dead", [(), (0,), (1, 3), (2,)])
 def test_derivatives_of_a_factor_are_those_of_its_operations(keep, floor, dead):

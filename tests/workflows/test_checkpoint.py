@@ -97,7 +97,7 @@ def whole():
     return functools.cache(fit)
 
 
-@pytest.mark.parametrize("sampler", ["nuts", "ram", "pmmh"])
+@pytest.mark.parametrize("sampler", ["nuts", "ram", pytest.param("pmmh", marks=pytest.mark.slow)])
 def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_path, stop_after):
     expected = whole(sampler)
     stop_after(0, steps=3)
@@ -363,6 +363,7 @@ def stopped(folder):
     return process, out, time.monotonic() - sent
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_usable_result_within_ten_seconds(tmp_path):
     process, out, seconds = stopped(tmp_path)
     assert process.returncode == 130 and seconds < 10, out

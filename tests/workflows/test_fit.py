@@ -272,6 +272,9 @@ def test_trajectories_have_the_exact_joint_distribution(known, exact):
     sd = np.sqrt(np.diag(covariance)[start:start + len(FORECAST)])
     assert sd[-1] > sd[-2] > sd[-3]  # a forecast widens towards the prior
     np.testing.assert_array_equal(paths["outputs"], paths["states"])
+    ahead, at = group(known, "predictions"), slice(start + len(FORECAST), None)
+    np.testing.assert_array_equal(ahead["outputs"], paths["outputs"])
+    np.testing.assert_allclose(ahead["y_mean"].values[0, 0].ravel(), mean[at], atol=2e-6)
 
 
 def test_posterior_predictive_is_the_smoothed_state_and_noise(known, exact):
@@ -374,19 +377,19 @@ def test_panel():
 
 
 def test_the_same_seed_gives_the_same_result(y):
-    settings = {"sampler": "ram", "chains": 1, "warmup": 5, "samples": 5, "trajectory_draws": 2, "at": [1.0, 5.0],
-                "init": init_to_uniform}
+    settings = {"sampler": "ram", "chains": 1, "warmup": 5, "samples": 5, "trajectory_draws": 2, "at": FORECAST,
+                "init": init_to_uniform, "fixed": {"decay[b]": 1.2}}
     with pytest.warns(lfm.ConvergenceWarning) as warned:
-        first = lfm.fit(one_parameter, TIMES, y, progress=False, **settings)
+        first = lfm.fit(motif.model, TIMES, y, progress=False, **settings)
     messages = " ".join(str(w.message) for w in warned)
     assert "R-hat" in messages and "decay" in messages
-    again = quiet_fit(one_parameter, TIMES, y, **settings)
-    other = quiet_fit(one_parameter, TIMES, y, **settings, seed=1)
+    again = quiet_fit(motif.model, TIMES, y, **settings)
+    other = quiet_fit(motif.model, TIMES, y, **settings, seed=1)
     for name in ("posterior", "trajectories", "posterior_predictive", "log_likelihood"):
         xr.testing.assert_identical(group(again, name), group(first, name))
         assert not group(other, name).equals(group(first, name))
     attrs = arviz_data.attributes(first)
-    assert (attrs["model"], attrs["thin"]) == ("one_parameter", 5)  # five steps for each parameter
+    assert (attrs["model"], attrs["thin"]) == ("model", 15)  # five steps for each of three parameters
 
 
 def converted(times, y=None, start=None, max_step=None):
@@ -400,6 +403,7 @@ def converted(times, y=None, start=None, max_step=None):
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, max_step=max_step), obs=y)
 
 
+@pytest.mark.slow
 def test_times_are_known_to_everything_after_sampling(y):
     keywords = {"start": -1.0, "max_step": 0.1}
     result = quiet_fit(converted, TIMES, y[:, :1], sampler="map", samples=4, trajectory_draws=2, at=[0.5, 9.0],
@@ -420,8 +424,8 @@ def test_what_fails_after_sampling_does_not_cost_the_draws(y, monkeypatch):
 
     monkeypatch.setattr("lfm_ppl.workflows.fit_results.scores", broken)
     with pytest.warns(UserWarning, match="scores.*no such thing"):
-        result = lfm.fit(one_parameter, TIMES, y, sampler="map", samples=5, trajectory_draws=0)
-    assert group(result, "posterior")["decay"].shape == (1, 5)
+        result = lfm.fit(motif.model, TIMES, y, sampler="map", samples=5, trajectory_draws=0)
+    assert group(result, "posterior")["decay"].shape == (1, 5, 2)
     assert "log_likelihood" not in arviz_data.groups(result)
 
 
@@ -463,7 +467,7 @@ def steep(times, y=None):
     model = lfm.LatentForceModel(
         lambda x, u, t: u - strength * x**3, {"u": lfm.Matern(1.0, 1.0)},
         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.ones(1), jnp.eye(1)))
-    numpyro.sample("y", lfm.MarginalLikelihood(model, times), obs=y)
+    numpyro.sample("y", lfm.MarginalLikelihood(model, times, iterations=0), obs=y)
 
 
 def test_nowhere_to_start_from_is_explained():
@@ -497,6 +501,7 @@ def decaying_counts(times, y=None, fault=None):
 DECAYING = np.array([98.0, 80, 50, 44, 28, 25])[:, None]
 
 
+@pytest.mark.slow
 def test_a_deterministic_state_is_fitted():
     """Against the posterior on a grid."""
     result = lfm.fit(decaying_counts, np.arange(6.0), DECAYING, chains=1, warmup=100, samples=400, progress=False)
@@ -511,8 +516,8 @@ def test_a_deterministic_state_is_fitted():
 
 
 @pytest.mark.parametrize("fault, reason", [
-    ("prior", "'level'"), ("factor", "'bound'"), ("gradient", "'rate'"), ("function", "row 4"),
-    pytest.param("law", "y", marks=pytest.mark.slow), pytest.param("sites", "1 sweeps", marks=pytest.mark.slow)])
+    ("factor", "'bound'"), ("function", "row 4"), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
+        ("prior", "'level'"), ("gradient", "'rate'"), ("law", "y"), ("sites", "1 sweeps")))])
 def test_the_part_that_fails_is_named_where_there_is_nowhere_to_start(fault, reason):
     times = 10.0 * np.arange(6.0) if fault == "law" else np.arange(6.0)
     with pytest.raises(ValueError, match=f"finite density.*{reason}") as error:

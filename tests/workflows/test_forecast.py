@@ -23,10 +23,10 @@ AT = np.array([0.7, 4.6, 5.1, 7.0])
 DRAWS = 2000
 
 
-def well(times, y=None, noise=0.0025):
+def well(times, y=None, iterations=3):
     a = numpyro.sample("a", dist.LogNormal(0.0, NEAR))
-    numpyro.sample("y", lfm.MarginalLikelihood(systems.double_well(a=-a, noise=noise, dispersion=DISPERSION), times),
-                   obs=y)
+    system = systems.double_well(a=-a, noise=0.0025, dispersion=DISPERSION)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, iterations=iterations), obs=y)
 
 
 def predictions(result):
@@ -89,40 +89,30 @@ def test_groups_coordinates_and_units(ahead, known):
     assert (wide > narrow).all()
 
 
-def test_fit_at_times_gives_the_same_predictions():
-    result = lfm.fit(motif.model, motif.TIMES, motif.data(), sampler="map", samples=20, trajectory_draws=20, at=AT,
-                     model_kwargs={"spread": NEAR}, progress=False)
-    mean, _ = motif.posterior(motif.data(), AT, **motif.THETA)
-    computed = predictions(result)
-    np.testing.assert_allclose(computed["y_mean"].values[0, 0].ravel(), mean[2 * len(motif.TIMES) + len(AT):],
-                               atol=2e-6)
-    paths = arviz_data.group(result, "trajectories")
-    np.testing.assert_array_equal(computed["outputs"].values, paths["outputs"].values)
-
-
 DISPERSION = 0.5
 LATER = np.array([3.0, 5.0])
 AROUND = 1.0 + np.array([-1e-6, 0.0, 1e-6])
 
 
+LAST_SEEN = np.array([0.0, 0.5, 1.0]), np.array([[-0.8], [-0.4], [0.05]])
+"""A double well on its way from one well to the other."""
+
+
+def fitted(draws, **keywords):
+    return lfm.fit(well, *LAST_SEEN, sampler="map", samples=draws, trajectory_draws=0, progress=False,
+                   model_kwargs=keywords)
+
+
 @pytest.fixture(scope="module")
 def between_the_wells():
-    """A double well that was last seen on its way from one well to the other, with its draws."""
-    times, y = np.array([0.0, 0.5, 1.0]), np.array([[-0.8], [-0.4], [0.05]])
-    result = lfm.fit(well, times, y, sampler="map", samples=DRAWS, trajectory_draws=0, progress=False)
-    return times, y, result
-
-
-@pytest.fixture(scope="module")
-def ahead_of_the_wells(between_the_wells):
-    return predictions(lfm.forecast(between_the_wells[2], well, np.concatenate([AROUND, LATER]), draws=DRAWS))
+    return fitted(DRAWS)
 
 
 @pytest.mark.slow
-def test_after_the_data_a_nonlinear_model_has_its_own_distribution(between_the_wells, ahead_of_the_wells):
+def test_after_the_data_a_nonlinear_model_has_its_own_distribution(between_the_wells):
     """Two wells, as the Fokker-Planck equation has them; Gaussian moments would fill the gap between."""
-    times, y, _ = between_the_wells
-    result = ahead_of_the_wells.isel(time=slice(3, None))
+    times, y = LAST_SEEN
+    result = predictions(lfm.forecast(between_the_wells, well, LATER, draws=DRAWS))
     model = systems.double_well(noise=0.0025, dispersion=DISPERSION)
     grid = lfm.fokker_planck(model, np.concatenate([times, LATER]), np.concatenate([y, np.full((2, 1), np.nan)]),
                              cells=500)
@@ -141,9 +131,10 @@ def test_after_the_data_a_nonlinear_model_has_its_own_distribution(between_the_w
         np.testing.assert_array_equal(result["y_mean"], result["outputs"])
 
 
-def test_one_path_goes_through_the_last_observation(ahead_of_the_wells):
+def test_one_path_goes_through_the_last_observation():
     """The simulated path starts where the smoothed one ends: neighbouring times stay near each other."""
-    states = ahead_of_the_wells["states"].values[0, :, :3, 0]
+    settings = {"model_kwargs": {"iterations": 0}, "draws": 200}
+    states = predictions(lfm.forecast(fitted(200, iterations=0), well, AROUND, **settings))["states"].values[0, :, :, 0]
     assert np.abs(np.diff(states, axis=1)).max() < 5 * DISPERSION * np.sqrt(1e-6)
     assert states.std(axis=0).min() > 0.03
 
@@ -151,8 +142,7 @@ def test_one_path_goes_through_the_last_observation(ahead_of_the_wells):
 @pytest.mark.slow
 def test_a_far_forecast_alone_is_that_of_many_times(between_the_wells):
     """Steps are as short as between the data, however long the way to the first time that was asked for."""
-    _, _, result = between_the_wells
-    alone = predictions(lfm.forecast(result, well, [21.0], draws=DRAWS))["states"].values[0, :, 0, 0]
+    alone = predictions(lfm.forecast(between_the_wells, well, [21.0], draws=DRAWS))["states"].values[0, :, 0, 0]
     # The stationary density exp(-2 V / g^2), with V = x^4/4 - x^2/2.
     x = np.linspace(-2.5, 2.5, 2001)
     density = np.exp(-2 * (x**4 / 4 - x**2 / 2) / DISPERSION**2)

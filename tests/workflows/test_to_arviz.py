@@ -16,6 +16,7 @@ import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data, tables
 from tests.inference import linear_motif as motif
 
+AT = [0.0, 0.7, 2.5, 3.2, 4.6, 6.0]  # as in test_fit.py, whose programs are then compiled already
 QUIET = {"progress_bar": False, "chain_method": "vectorized"}
 
 
@@ -45,7 +46,7 @@ def mcmc():
 def converted(mcmc):
     y = pd.DataFrame(motif.data(), columns=["CDKN1A", "SESN1"])
     with pytest.warns(lfm.ConvergenceWarning):
-        return lfm.to_arviz(mcmc, model, motif.TIMES, y, trajectory_draws=8, at=[0.0, 6.0],
+        return lfm.to_arviz(mcmc, model, motif.TIMES, y, trajectory_draws=8, at=AT,
                             dims={"half_life": ["gene"]}, coords={"gene": ["p21", "sestrin"]})
 
 
