@@ -470,6 +470,7 @@ def steep(times, y=None):
     numpyro.sample("y", lfm.MarginalLikelihood(model, times, iterations=0), obs=y)
 
 
+@pytest.mark.slow
 def test_nowhere_to_start_from_is_explained():
     with pytest.raises(ValueError, match="row 1"):
         lfm.fit(steep, np.arange(3.0), np.ones((3, 1)), sampler="map", progress=False)
