@@ -113,6 +113,7 @@ def assert_uniform(result, bins):
     assert min(min(pair.values()) for pair in values.values()) > 0.001, values
 
 
+@pytest.mark.slow
 def test_random_walks_with_expectation_propagation_are_calibrated():
     """A small one: 24 data sets of 6 rows, and random walks, whose program is a fraction of that of NUTS."""
     result = calibration.calibrate(jax.random.key(4), counts, np.arange(6.0), lfm.RAM, data_sets=24, draws=15, thin=10,

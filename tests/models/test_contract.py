@@ -21,7 +21,7 @@ MODELS = sorted(loading.available())
 CHEAP = ("spring", "ginzburg-landau", "ballistic")
 """Models that are simulated from the prior by default; of others the density alone is asked for."""
 
-COSTLY = ("gps", "epidemic", "thyroid")
+COSTLY = ("ballistic-3d", "call-centre", "epidemic", "gps", "home-heating", "thyroid")
 """Models whose density takes long to compile; it is run with -m slow."""
 
 

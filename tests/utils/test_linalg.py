@@ -70,6 +70,7 @@ def test_derivatives_of_products(shapes):
             assert np.allclose(result, expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max(initial=1.0))
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_congruence_off_symmetry():
     """Of a matrix that is not symmetric the symmetric part counts, in the first and the second order."""
     rng = np.random.default_rng(4)
