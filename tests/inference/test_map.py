@@ -314,3 +314,23 @@ def impossible():
 def test_bad_input_is_named(model, options, name):
     with pytest.raises(ValueError, match=name):
         map_estimate(model, **options)
+
+
+def test_derivatives_that_do_not_exist_are_reported():
+    @jax.custom_jvp
+    def rough(x):
+        return x**2
+
+    @rough.defjvp
+    def rough_jvp(primals, tangents):
+        return rough(*primals), jnp.nan * tangents[0]
+
+    def model():
+        numpyro.factor("rough", -rough(numpyro.sample("x", dist.Normal())))
+
+    with pytest.warns(UserWarning, match="derivatives are not finite"):
+        result = map_estimate(model, restarts=1)
+    assert not result.converged
+    assert np.isnan(result.log_evidence)
+    with pytest.raises(ValueError, match="no Laplace approximation to draw from"):
+        result.sample(jax.random.key(0), 3)
