@@ -11,6 +11,7 @@ import xarray as xr
 from scipy import stats
 
 import lfm_ppl as lfm
+from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.results import accuracy, arviz_data, importance, likelihoods, rebuilding
 from lfm_ppl.results.accuracy import check_accuracy
 from lfm_ppl.results.correction import correct_posterior
@@ -238,8 +239,9 @@ def test_particles_and_grid_agree(bent):
 @pytest.mark.slow
 def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     """Importance weights from draws of the wrong posterior against quadrature with the exact likelihood."""
-    result = bent
-    problem = rebuilding.problem(result, well)
+    single_pass = approximate(well, iterations=0)
+    result = arviz_data.build({name: arviz_data.group(bent, name) for name in ("posterior", "observed_data")}, {})
+    problem = rebuilding.problem(result, single_pass)
     nodes = np.linspace(0.15, 5.0, 60)
     posteriors = {}
     at_nodes = replace(problem, draws={"depth": nodes})
@@ -256,14 +258,14 @@ def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     draws = np.interp(np.random.default_rng(0).uniform(size=(4, 100)), cumulative, nodes)
     replaced = arviz_data.build({"posterior": xr.Dataset({"depth": (("chain", "draw"), draws)}),
                                  "observed_data": arviz_data.group(result, "observed_data")}, {"sampler": "nuts"})
-    report = check_accuracy(replaced, well, draws=400, progress=False)
+    report = check_accuracy(replaced, single_pass, draws=400, progress=False)
     row = report.table.loc["depth"]
     assert report.reliable
-    assert abs(posteriors["exact"][1] - posteriors["wrong"][1]) > 0.05 * posteriors["wrong"][2]
+    assert abs(posteriors["exact"][1] - posteriors["wrong"][1]) > 0.15 * posteriors["wrong"][2]
     assert abs(row["corrected_mean"] - posteriors["exact"][1]) < 3.5 * row["corrected_mean_se"] + 0.01
     assert abs(row["corrected_sd"] / row["sd"] - posteriors["exact"][2] / posteriors["wrong"][2]) \
         < 3.5 * row["sd_ratio_se"] + 0.02
-    corrected = correct_posterior(replaced, well)
+    corrected = correct_posterior(replaced, single_pass)
     again = arviz_data.group(corrected, "posterior")["depth"].values
     assert again.shape == (4, 100) and set(again.ravel()) <= set(draws.ravel())
     assert abs(again.mean() - posteriors["exact"][1]) < 4 * posteriors["exact"][2] / np.sqrt(report.ess)
