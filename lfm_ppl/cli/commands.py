@@ -26,7 +26,7 @@ from lfm_ppl.cli.options import (
     GENERAL,
     CheckOptions,
     Debug,
-    FitOptions,
+    FitArguments,
     ForecastOptions,
     Line,
     Model,
@@ -136,7 +136,7 @@ def simulate(model: Model, /, *, options: SimulateOptions = SimulateOptions()) -
     "fit my_model.py --data 'patients/*.csv' --each --sampler map --jobs 2",
     "fit my_model.py --data mine.csv --rule gauss-hermite --steps 20",
 ))
-def fit(model: Model, /, *, options: FitOptions = FitOptions(), line: Line = ()) -> int:
+def fit(model: Model, /, *, options: FitArguments = FitArguments(), line: Line = ()) -> int:
     """Infer parameters and forces, and write posterior, summary, figures and a report."""
     from lfm_ppl.cli.fit import run
 

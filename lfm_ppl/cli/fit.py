@@ -22,7 +22,7 @@ import lfm_ppl
 from lfm_ppl.cli import choices, fit_many, page, results, session
 from lfm_ppl.cli.data_file import read_data
 from lfm_ppl.cli.fit_arguments import approximated_model, result_attributes, sampling_arguments
-from lfm_ppl.cli.options import DataOptions, FitOptions
+from lfm_ppl.cli.options import DataOptions, FitArguments
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.io import loading
@@ -34,7 +34,7 @@ from lfm_ppl.utils.interruption import INTERRUPTED, interruptible
 from lfm_ppl.utils.progress import duration
 
 
-def run(name: str, options: FitOptions, line: Sequence[str]) -> int:
+def run(name: str, options: FitArguments, line: Sequence[str]) -> int:
     """Fit, print the summary, and write the results; the posterior is on disk before any figure."""
     if options.data.each or options.data.series is not None:
         return fit_many.run(name, options, line)
@@ -102,7 +102,7 @@ def observed_data(options: DataOptions, model: loading.ModelFile, model_options:
     return model.prepare(observed)
 
 
-def _print_data(options: FitOptions, model: loading.ModelFile, observed: Data, fixed: dict[str, Any]) -> None:
+def _print_data(options: FitArguments, model: loading.ModelFile, observed: Data, fixed: dict[str, Any]) -> None:
     print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")
     counts = dict(zip(observed.outputs, np.isnan(observed.y).reshape(-1, len(observed.outputs)).sum(axis=0),
                       strict=True))
@@ -126,7 +126,7 @@ def _print_data(options: FitOptions, model: loading.ModelFile, observed: Data, f
         print(f"fixed    {name} = {value}" + (f" by the model; --set {name}=free frees it" if is_anchor else ""))
 
 
-def _print_settings(options: FitOptions, model_options: dict[str, Any], observed: Data) -> None:
+def _print_settings(options: FitArguments, model_options: dict[str, Any], observed: Data) -> None:
     approximation, inference = options.approximation, options.inference
     where = "" if approximation.grid is None else f" at {approximation.grid} times"
     for flag, sign, bounds in (("--lower", ">=", approximation.lower), ("--upper", "<=", approximation.upper)):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from lfm_ppl.cli import choices, page
-from lfm_ppl.cli.options import Approximation, FitOptions
+from lfm_ppl.cli.options import Approximation, FitArguments
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
@@ -15,7 +15,7 @@ from lfm_ppl.io.data_set import Data
 _SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
 
 
-def approximated_model(options: FitOptions, model: loading.ModelFile) -> Any:
+def approximated_model(options: FitArguments, model: loading.ModelFile) -> Any:
     """Return the NumPyro model with the user's settings of the approximation.
 
     Raises:
@@ -45,7 +45,7 @@ def _bounds(approximation: Approximation) -> dict[str, Any]:
     return {name: value for name, value in (bounds | {"grid": approximation.grid}).items() if value is not None}
 
 
-def sampling_arguments(options: FitOptions, model: loading.ModelFile) -> dict[str, Any]:
+def sampling_arguments(options: FitArguments, model: loading.ModelFile) -> dict[str, Any]:
     """Return the arguments that `lfm_ppl.fit` and `lfm_ppl.fit_many` share."""
     inference = options.inference
     names = ("sampler", "chains", "warmup", "samples", "thin", "trajectory_draws", "init", "seed")
@@ -57,7 +57,7 @@ def sampling_arguments(options: FitOptions, model: loading.ModelFile) -> dict[st
             "sampler_options": {name: value for name, value in sampler_options.items() if value is not None}}
 
 
-def result_attributes(options: FitOptions, line: Sequence[str], model: loading.ModelFile, observed: Data,
+def result_attributes(options: FitArguments, line: Sequence[str], model: loading.ModelFile, observed: Data,
                       model_options: dict[str, Any]) -> dict[str, Any]:
     """Return the attributes of a result that `lfm-ppl check` and `forecast` read."""
     is_shipped = loading.available().get(model.name) == model.path

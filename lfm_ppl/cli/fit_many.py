@@ -21,7 +21,7 @@ import lfm_ppl
 from lfm_ppl.cli import choices, results, session
 from lfm_ppl.cli.data_file import read_data, read_series
 from lfm_ppl.cli.fit_arguments import approximated_model, result_attributes, sampling_arguments
-from lfm_ppl.cli.options import DataOptions, FitOptions
+from lfm_ppl.cli.options import DataOptions, FitArguments
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
@@ -36,7 +36,7 @@ _SHOWN = 10
 """Number of failures whose reasons are printed; ``failed.csv`` has all."""
 
 
-def run(model_name: str, options: FitOptions, line: Sequence[str]) -> int:
+def run(model_name: str, options: FitArguments, line: Sequence[str]) -> int:
     """Fit every data set without a stored result; return 1 if some failed."""
     workers = options.processes.workers
     session.start(1, not options.output.no_cache, one_thread=True)

@@ -1,6 +1,6 @@
 """Options of the commands as frozen dataclasses, whose docstrings are the help texts.
 
-Fields of nested dataclasses are options as well: ``FitOptions().data.truth`` is ``--truth``. This module imports
+Fields of nested dataclasses are options as well: ``FitArguments().data.truth`` is ``--truth``. This module imports
 nothing that takes long, so that the help of a command appears at once.
 """
 
@@ -287,7 +287,7 @@ class Workers:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class FitOptions:
+class FitArguments:
     """Options of ``lfm-ppl fit``."""
 
     data: DataOptions = DataOptions()

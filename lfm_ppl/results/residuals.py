@@ -42,10 +42,9 @@ def mean_residuals(result: Any) -> xr.DataArray:
 def autocorrelation(residual: np.ndarray, lags: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the autocorrelation of a series with gaps, and how many pairs each lag has.
 
-    rho_h = mean of (e_k - m)(e_k+h - m) over the pairs that are both there, divided by the mean of
-    (e_k - m)^2. Lags count rows, also where these are not equally spaced in time. Of an output
-    that fewer than half of the rows have, or whose observations form hardly any pairs at some lag, as those of every
-    second row, they count its observations.
+    rho_h = mean of (e_k - m)(e_k+h - m) over the pairs of present values, divided by the mean of (e_k - m)^2. Lags count
+    rows, also where rows are not equally spaced in time. For an output that is present in fewer than half of the rows, or
+    that has hardly any pairs at some lag (an output measured every second row), lags count its observations.
 
     Args:
         residual: shape (T,), NaN where missing.

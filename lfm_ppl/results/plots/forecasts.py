@@ -1,7 +1,7 @@
 """Forecasts in the figures over time: the rows that are shown before them, and their curves.
 
 1. Next to a forecast that was made after the fit and is short beside the data, `recent_part` keeps the last rows only.
-2. Mean and bands continue those of the fit. Predictions at few times are bars: the curve between them is unknown.
+2. Mean and bands continue the curves of the fit. Predictions at few times are bars: the curve between them is unknown.
 """
 
 from __future__ import annotations
