@@ -42,9 +42,9 @@ def mean_residuals(result: Any) -> xr.DataArray:
 def autocorrelation(residual: np.ndarray, lags: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the autocorrelation of a series with gaps, and how many pairs each lag has.
 
-    rho_h = mean of (e_k - m)(e_k+h - m) over the pairs of present values, divided by the mean of (e_k - m)^2. Lags count
-    rows, also where rows are not equally spaced in time. For an output that is present in fewer than half of the rows, or
-    that has hardly any pairs at some lag (an output measured every second row), lags count its observations.
+    rho_h = mean of (e_k - m)(e_k+h - m) over the pairs of present values, divided by the mean of (e_k - m)^2. Lags
+    count rows, also where rows are not equally spaced in time. For an output that is present in fewer than half of the
+    rows, or that has hardly any pairs at some lag (an output measured every second row), lags count its observations.
 
     Args:
         residual: shape (T,), NaN where missing.
