@@ -31,6 +31,7 @@ def test_check_prints_stores_and_draws(run, fitted):
     assert status == 0 and "accuracy.png" in out
 
 
+@pytest.mark.slow
 def test_new_chains_follow_a_check_that_requires_them(run, well, fitted, monkeypatch):
     assert run(f"check {fitted} --draws 40 --quiet")[0] == 0
     result = arviz_data.load(fitted)

@@ -61,7 +61,8 @@ EVOLUTIONS = {
 IRREGULAR = np.sort(np.random.default_rng(0).uniform(0.0, 100.0, 700))
 
 
-@pytest.mark.parametrize("name", EVOLUTIONS)
+@pytest.mark.parametrize("name", [name if name == "rough" else pytest.param(name, marks=pytest.mark.slow)
+                                  for name in EVOLUTIONS])
 def test_the_estimate_is_the_error_of_dense_algebra(name):
     evolution, kernel = EVOLUTIONS[name]
     for times in (WEEKLY[:300], WEEKLY, IRREGULAR):
