@@ -107,4 +107,3 @@ def _number(name: str, text: str) -> Any:
         ) from None
     checks.finite(f"--set {name}", np.array(values))
     return values[0] if len(values) == 1 else values
-

@@ -78,7 +78,8 @@ def parse(line: Sequence[str]) -> tuple[Callable[..., int | None], inspect.Bound
     if not words:
         raise ValueError("name a command; `lfm-ppl --help` lists them.")
     if words[0] == "compare":
-        positions = [index for index, word in enumerate(words) if word.replace("_", "-") in catalogue.names()]
+        positions = [index for index, word in enumerate(words) if word.replace("_", "-") in catalogue.names()
+                     and words[index - 1] not in ("--out", "--data")]
         if positions:  # options may stand before the name
             name = words.pop(positions[0]).replace("_", "-")
             words.insert(1, name)

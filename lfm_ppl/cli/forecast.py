@@ -148,11 +148,10 @@ def _write(forecast: Any, scores: pd.DataFrame | None, task: StoredFit, path: Pa
     if scores is not None:
         print(f"\n{tables.text_table(scores, width=shutil.get_terminal_size().columns)}\n")
         print(f"wrote    {tables.write_csv(scores, folder / SCORES, options.overwrite, index_label='output')}")
-    figures = dict(_figures(forecast))
-    status = max(page.draw(plot, forecast, folder / name, options.overwrite) for name, plot in figures.items())
+    statuses = {name: page.draw(plot, forecast, folder / name, options.overwrite) for name, plot in _figures(forecast)}
     more = {} if scores is None else {"Scores on the held-out data": scores}
-    paths = [path for name in figures if (path := folder / name).is_file()]
-    return max(status, page.update(updated, folder, paths, more))
+    paths = [folder / name for name, status in statuses.items() if status == 0]
+    return max(*statuses.values(), page.update(updated, folder, paths, more))
 
 
 def _figures(forecast: Any) -> Iterator[tuple[str, Callable]]:

@@ -27,6 +27,7 @@ def describe_model(name: str) -> None:
     """Print the constants of a model file, and the parameters, forces and states of its model."""
     model = loading.load(name)
     print(f"{model.name}  ({model.path})\n\n{model.description}\n")
+
     def with_unit(name: str) -> str:
         return f"{name} ({unit})" if (unit := model.units.get(name)) else name
 

@@ -157,9 +157,9 @@ class DataOptions:
     """fit each series separately: the rows with the same value in this column"""
     columns: Annotated[Columns, Parameter(name="*")] = Columns()
     time_unit: Annotated[Text, Parameter(metavar="UNIT")] | None = None
-    """unit of times that are dates: ms, s, min, h, d, week, yr (default: the model's, else by the gaps)"""
+    """unit of times that are dates: ms, s, min, h, d, weeks, years (default: the model's, else by the gaps)"""
     truth: File | None = None
-    """true values, drawn in the figures: the file that `simulate` wrote, or a JSON file with "times" and "forces",
+    """true values for the figures and tables: the file that `simulate` wrote, or a JSON file with "times" and "forces",
     "state" or "parameters\""""
 
     def __post_init__(self) -> None:
@@ -375,7 +375,7 @@ class StudyOptions(Output):
     """Options of every study."""
 
     out: Folder | None = None
-    """folder to write; what it holds already is kept and used (default: lfm-results/compare/NAME)"""
+    """folder to write; results of the same settings that it holds are used again (default: lfm-results/compare/NAME)"""
     quick: bool = False
     """few and small: it shows that it runs, and no more"""
     processes: Annotated[Workers, Parameter(name="*")] = Workers()

@@ -45,6 +45,7 @@ def start(chains: int, keep_programs: bool = True, one_thread: bool = False) -> 
     if keep_programs and not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
         folder = cache_folder()
         if folder is not None and _is_ready(folder):
+            _add_missing_stamps(folder)
             jax.config.update("jax_compilation_cache_dir", str(folder))
             jax.config.update("jax_compilation_cache_max_size", _LARGEST)
             jax.config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_S)
@@ -63,6 +64,17 @@ def cache_folder() -> Path | None:
     if not os.path.isabs(base):  # the XDG specification ignores relative paths
         base = os.path.expanduser("~/.cache")
     return Path(base) / "lfm_ppl" / hashlib.sha256(_cpu().encode()).hexdigest()[:12]
+
+
+def _add_missing_stamps(folder: Path) -> None:
+    """Write the time of the last use that JAX stores beside each program, where a killed process has not.
+
+    JAX 0.10 caches nothing more after one program without it (``jax/_src/lru_cache.py``).
+    """
+    for program in folder.glob("*-cache"):
+        stamp = program.with_name(program.name.removesuffix("-cache") + "-atime")
+        if not stamp.exists():
+            stamp.write_bytes(bytes(8))
 
 
 def _cpu() -> str:

@@ -27,7 +27,7 @@ def run(name: str, options: SimulateOptions) -> None:
     if simulated.truth is not None:
         with atomic_files.atomic_write(truth_file, options.overwrite) as temporary:
             write_truth(simulated, temporary)
-        print(f"wrote {truth_file}: what it was simulated from")
+        print(f"wrote {truth_file}: the parameters, states and forces of the simulation")
         words += ["--truth", str(truth_file)]
     for text in options.option:
         words += ["--option", text]

@@ -61,7 +61,7 @@ def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit
     if clock := unit_of(group["time"]):
         units["time"] = clock
     observed = Data(times, y, outputs, units={**model.units, **units}, inputs=inputs_of(posterior),
-                         origin=attrs.get(ORIGIN))
+                    origin=attrs.get(ORIGIN))
     options = _json_attribute(attrs, "options", path)
     unknown = sorted(set(options) - set(model.options))
     if unknown:

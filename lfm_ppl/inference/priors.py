@@ -71,7 +71,10 @@ def _interval_in_words(distribution: Any, entries: Any = ...) -> str:
     try:
         quantiles = [np.asarray(base.icdf(probability)) for probability in _INTERVAL]
     except (NotImplementedError, ImportError, AttributeError):  # no closed form: draws give two digits
-        draws = base.sample(jax.random.key(0), (_DRAWS,))
+        try:
+            draws = base.sample(jax.random.key(0), (_DRAWS,))
+        except NotImplementedError:  # an improper prior
+            return _in_words(base)
         quantiles = [_rounded(value) for value in np.quantile(draws, _INTERVAL, axis=0)]
     median, low, high = (_number(np.broadcast_to(value, distribution.shape())[entries]) for value in quantiles)
     return f"median {median}, 95% {low} to {high} ({type(base).__name__})"

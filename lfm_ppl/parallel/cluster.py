@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 _HAS_DASK = importlib.util.find_spec("distributed") is not None
 
 _CACHE_FOLDER, _SHORTEST = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+_CACHE_SIZE = "jax_compilation_cache_max_size"
 _ANSWER_S = 30
 """Seconds in which a scheduler must answer, and then in which it must have a worker."""
 
@@ -84,7 +85,7 @@ def _start_processes(count: int, stack: contextlib.ExitStack) -> Cluster:
     import dask
     from distributed import Client, LocalCluster
 
-    cache = {name: getattr(jax.config, name) for name in (_CACHE_FOLDER, _SHORTEST)}
+    cache = {name: getattr(jax.config, name) for name in (_CACHE_FOLDER, _SHORTEST, _CACHE_SIZE)}
     if cache[_CACHE_FOLDER] is None:
         cache = {_CACHE_FOLDER: stack.enter_context(tempfile.TemporaryDirectory(prefix="lfm-ppl-")), _SHORTEST: 0.0}
     # The profiler of the dashboard samples the stack every hundredth of a second.
@@ -110,13 +111,17 @@ def _connect(address: str, stack: contextlib.ExitStack) -> Cluster:
         raise ClusterError(f"no scheduler with workers answers at {address} ({error}). {remedy}") from error
     if max(client.nthreads().values()) > 1:
         raise ClusterError(f"a worker of {address} has several threads, but models are traced by one. {remedy}")
+    try:
+        client.run(_versions)
+    except ModuleNotFoundError as error:
+        raise ClusterError(f"a worker of {address} does not have lfm_ppl ({error}). {remedy}") from error
     return Cluster(client, {})
 
 
 def compute_on_workers(cluster: Cluster, tasks: list[Task], compute: Compute) -> Iterator[Computed]:
     """Yield each task when it ends, with the value of `compute_task` or its error, and the number of workers."""
     import cloudpickle
-    from distributed import CancelledError, as_completed
+    from distributed import CancelledError, KilledWorker, as_completed
 
     # By default each process would take three quarters of an accelerator's memory.
     defaults = {"XLA_FLAGS": "", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
@@ -140,6 +145,8 @@ def compute_on_workers(cluster: Cluster, tasks: list[Task], compute: Compute) ->
             task, error = futures.pop(future), future.exception()
             if isinstance(error, ClusterError):
                 raise error
+            if isinstance(error, KilledWorker):
+                error = ClusterError("workers died during this task, probably for lack of memory; use fewer (--jobs).")
             outcome = future.result() if error is None else error
             del future  # workers may free the result
             yield task, outcome, submit()

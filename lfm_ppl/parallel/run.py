@@ -117,8 +117,8 @@ def _stored(task: Task, store: RunStore, overwrite: bool) -> Result | None:
     arrays = None
     try:
         arrays = store.get(task.stem, task.record(), overwrite)
-    except DamagedFileError as error:
-        warnings.warn(f"{error} Its task runs again.", stacklevel=3)
+    except DamagedFileError:
+        warnings.warn(f"{store.path(task.stem)} is damaged; its task runs again.", stacklevel=3)
     return arrays if arrays is None else _plain(arrays)
 
 

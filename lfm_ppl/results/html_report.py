@@ -268,7 +268,7 @@ def _accuracy(result: Any, folder: Path) -> dict[str, Any]:
 def _forecast(result: Any, more: Mapping[str, pd.DataFrame]) -> dict[str, Any] | None:
     """Return tables of the predictions, after the data where any of them are."""
     if not arviz_data.has_group(result, predictions.GROUP):
-        return {"tables": more, "label": "", "count": 0, "most_series": 0, "total": 0} if more else None
+        return {"tables": more, "more": more, "label": "", "count": 0, "most_series": 0, "total": 0} if more else None
     dataset = arviz_data.group(result, predictions.GROUP)
     times, unit, origin = np.asarray(dataset["time"].values, float), time_unit(result), _origin(result)
     later = np.flatnonzero(times > dataset.attrs.get("last_observation", np.inf))
@@ -283,9 +283,9 @@ def _forecast(result: Any, more: Mapping[str, pd.DataFrame]) -> dict[str, Any] |
     count = dataset.sizes.get("series", 0)
     names = dataset["series"].values if "series" in dataset.coords else range(count)
     series = {f"Series {name}": table(dataset.isel(series=number)) for number, name in enumerate(names[:_MOST_SERIES])}
-    return {"tables": (series or {"": table(dataset)}) | dict(more), "label": f"time ({unit})" if unit and not origin
-            else "time", "is_later": later.size > 0, "shown": thinned.size, "total": index.size, "count": count,
-            "most_series": _MOST_SERIES}
+    return {"tables": (series or {"": table(dataset)}) | dict(more), "more": more,
+            "label": f"time ({unit})" if unit and not origin else "time", "is_later": later.size > 0,
+            "shown": thinned.size, "total": index.size, "count": count, "most_series": _MOST_SERIES}
 
 
 def _plain(value: Any) -> str:

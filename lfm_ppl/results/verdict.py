@@ -229,4 +229,3 @@ def _notes(findings: Findings) -> list[str]:
         notes.append(f"The reference finds the data impossible at {findings.impossible} of {findings.checked} draws; "
                      "they have weight zero.")
     return notes
-

@@ -59,7 +59,7 @@ class Interruption:
         self.requests += 1
         if self.requests > 1 or not self._is_deferring:
             raise KeyboardInterrupt
-        print("\nstopping after this block of draws; once more to stop at once", file=sys.stderr, flush=True)
+        print("\nstopping after this block of draws; once more to stop without it", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

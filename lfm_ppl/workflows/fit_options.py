@@ -134,11 +134,19 @@ def describe_assumptions(bound: BoundModel) -> str:
     trace = bound.trace()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a draw of the prior may be extreme
-        another = bound.likelihood({name: trace[name]["fn"].sample(jax.random.key(0)) for name in bound.sites})
+        another = bound.likelihood({name: _draw(trace[name]["fn"], trace[name]["value"]) for name in bound.sites})
     example = another.first if isinstance(another, Panel) else another
     others = assumptions(example.ssm.model)
     return json.dumps({topic: without_parameters(description, others[topic])
                        for topic, description in assumptions(bound.site.example.ssm.model).items()})
+
+
+def _draw(prior: Any, value: Any) -> Any:
+    """Return a draw of a prior; of an improper one, which has no draws, ``value`` and a percent of it."""
+    try:
+        return prior.sample(jax.random.key(0))
+    except NotImplementedError:
+        return 1.01 * value
 
 
 def model_docstring(numpyro_model: Any) -> str | None:

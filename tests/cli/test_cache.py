@@ -49,7 +49,10 @@ def test_a_command_stores_its_programs_and_uses_them_again(tmp_path):
 
 
 def test_the_folder_and_its_size_are_set_for_the_process(home, tmp_path):
+    session.cache_folder().mkdir(parents=True, mode=0o700)
+    (session.cache_folder() / "killed-cache").write_bytes(b"")  # by a process that was killed before it wrote the time
     session.start(1)
+    assert (session.cache_folder() / "killed-atime").is_file()
     assert Path(jax.config.jax_compilation_cache_dir) == session.cache_folder()
     assert session.cache_folder().is_dir() and session.cache_folder().parent == home / "lfm_ppl"
     assert jax.config.jax_compilation_cache_max_size == 2**30

@@ -50,6 +50,11 @@ def test_the_help_of_a_study_has_an_option_for_each_setting(run, name):
         assert all(alias in out for alias in field.metadata["declaration"].aliases)
 
 
+def test_an_option_may_have_the_name_of_a_study_as_its_value(run, requests, tmp_path):
+    assert run("compare --out gps ginzburg-landau --quiet")[0] == 0
+    assert requests[0].folder.name == "gps" and (tmp_path / "gps" / "index.html").is_file()
+
+
 def test_it_prints_tables_progress_and_files(run, requests, tmp_path):
     status, out, err = run("compare ginzburg-landau --realisations 3 --conditional 7 --seed 5 --out here")
     assert status == 0 and err == "1/1 task\n"

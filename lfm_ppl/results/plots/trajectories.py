@@ -138,7 +138,7 @@ def plot_states(result: Any, states: Sequence[str] | None = None, *, width: str 
 
 @style.styled
 def plot_deterministics(result: Any, names: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
-    """Draw the posterior mean of what follows from states and forces with a 95% band, its forecast, and its truth.
+    """Draw the posterior mean of the deterministics with a 95% band, its forecast, and its truth.
 
     Args:
         result: with the group trajectories, of a model with ``deterministics``, predictions, and truth where known.
