@@ -32,7 +32,7 @@ def run(entry: CatalogueEntry, values: Mapping[str, Any], options: StudyOptions,
     workers, study = options.processes.workers, entry.study
     settings = study.settings.from_command_line(report, options.quick, **values)
     path = Path(options.out or results.FOLDER / "compare" / (f"{entry.name}-quick" if options.quick else entry.name))
-    with results.lasting(path) as folder:
+    with results.open_folder(path) as folder:
         html_report.refuse_foreign(folder / PAGE, options.overwrite)
         start_time = time.perf_counter()
         result = study.run(settings, folder, overwrite=options.overwrite, report=report, workers=workers)
@@ -45,7 +45,7 @@ def run(entry: CatalogueEntry, values: Mapping[str, Any], options: StudyOptions,
     print(f"\ntime     {duration(time.perf_counter() - start_time)}")
     for path in written:
         print(f"wrote    {path}")
-    return page.attempted(lambda: _write_page(folder, entry, result, written, page.command_line(line)))
+    return page.report_failure(lambda: _write_page(folder, entry, result, written, page.command_line(line)))
 
 
 def _write_page(folder: Path, entry: CatalogueEntry, result: StudyResult, written: list[Path], command: str) -> Path:

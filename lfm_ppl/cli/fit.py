@@ -151,7 +151,7 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
     # A checkpoint has written a partial or complete result under this name.
     written = [arviz_data.save(posterior, folder / files.POSTERIOR, overwrite=True)]
     table, attrs = arviz_data.summary(posterior), arviz_data.attributes(posterior)
-    written.append(tables.write_csv(tables.annotated(table, posterior), folder / results.SUMMARY, overwrite))
+    written.append(tables.write_csv(tables.annotate(table, posterior), folder / results.SUMMARY, overwrite))
     print(f"\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}\n")
     for message in misfit(posterior):
         print(f"note     {message}")

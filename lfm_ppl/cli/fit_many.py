@@ -64,7 +64,7 @@ def run(model_name: str, options: FitArguments, line: Sequence[str]) -> int:
         name, reason = next(iter(failed.items()))
         raise ValueError(f"no data set can be used ({len(failed)} failed). {name}: {reason}")
     path = Path(options.output.out or results.FOLDER / f"{model.name}-many")
-    with results.lasting(path) as folder, _pickled_by_value(model, workers):
+    with results.open_folder(path) as folder, _pickled_by_value(model, workers):
         fits = lfm_ppl.fit_many(
             approximated_model(options, model), data_sets, out=folder, workers=workers, each=arguments,
             progress=not options.output.quiet, **sampling_arguments(options, model))
@@ -86,7 +86,7 @@ def _write(fitted: Any, folder: Path, attributes: dict[str, Any]) -> None:
         return
     fitted.result.attrs.update(attributes)
     arviz_data.save(fitted.result, target / files.POSTERIOR, overwrite=True)
-    summary = tables.annotated(arviz_data.summary(fitted.result), fitted.result)
+    summary = tables.annotate(arviz_data.summary(fitted.result), fitted.result)
     tables.write_csv(summary, target / results.SUMMARY, overwrite=True)
     try:
         html_report.save_report(fitted.result, target / html_report.NAME, overwrite=True, figures=[])

@@ -75,7 +75,7 @@ def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) 
     known_inputs = {}
     if held_out is not None:
         times = np.union1d(times, held_out.times)
-        known_inputs = {name: Input(*joined(task.observed.inputs[name], later))
+        known_inputs = {name: Input(*join_inputs(task.observed.inputs[name], later))
                         for name, later in held_out.inputs.items()}
     keywords: dict[str, Any] = {"inputs": known_inputs, "model_kwargs": task.keywords}
     forecast = lfm_ppl.forecast(task.posterior, task.model, times, draws=options.draws, seed=options.seed,
@@ -89,7 +89,7 @@ def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) 
     return arviz_data.add_group(forecast, HELD_OUT, group), scores
 
 
-def joined(earlier: InputTable, later: InputTable) -> InputTable:
+def join_inputs(earlier: InputTable, later: InputTable) -> InputTable:
     """Return a known input followed by later values."""
     is_earlier = earlier.times < later.times[0]
     return InputTable(np.append(earlier.times[is_earlier], later.times),
@@ -118,7 +118,7 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
         print(f"note     {repeated_rows} of {len(read.times)} rows of {path} are at times of the fitted data: if they "
               "are the same data, their scores are not scores of a forecast")
     prepared = task.file.prepare(dataclasses.replace(read, inputs={
-        name: joined(observed.inputs[name], later) for name, later in read.inputs.items()}))
+        name: join_inputs(observed.inputs[name], later) for name, later in read.inputs.items()}))
     if not np.array_equal(prepared.y, read.y, equal_nan=True):
         raise ValueError(f"{task.file.path} changes the numbers of a data file in `prepare`, so that held-out numbers "
                          "may not be comparable with the fitted ones. Score them in Python, on the model's scale: "

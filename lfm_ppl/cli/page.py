@@ -26,7 +26,8 @@ def refuse_foreign(folder: Path, overwrite: bool) -> None:
 
 def save(result: Any, folder: Path, overwrite: bool, figures: Sequence[Path]) -> int:
     """Write the report with the figures (PNG files); return 1 if that fails."""
-    return attempted(lambda: html_report.save_report(result, folder / html_report.NAME, overwrite, figures=figures))
+    return report_failure(
+        lambda: html_report.save_report(result, folder / html_report.NAME, overwrite, figures=figures))
 
 
 def update(result: Any, folder: Path, figures: Sequence[Path] = (),
@@ -47,7 +48,7 @@ def update(result: Any, folder: Path, figures: Sequence[Path] = (),
         return html_report.save_report(result, folder / html_report.NAME, overwrite=True, figures=[*stored, *figures],
                                        more=more)
 
-    return attempted(write)
+    return report_failure(write)
 
 
 def draw(plot: Callable, result: Any, path: Path, overwrite: bool) -> int:
@@ -58,10 +59,10 @@ def draw(plot: Callable, result: Any, path: Path, overwrite: bool) -> int:
             figure.savefig(temporary, format="png")
         return path
 
-    return attempted(write, "figure")
+    return report_failure(write, "figure")
 
 
-def attempted(write: Callable[[], Path], kind: str = "page") -> int:
+def report_failure(write: Callable[[], Path], kind: str = "page") -> int:
     """Write a file and print its path; print the reason of a failure and return 1."""
     try:
         print(f"wrote    {write()}")

@@ -32,7 +32,7 @@ def folder(name: str, out: str | None, overwrite: bool) -> Iterator[Path]:
         if path.is_dir() and not overwrite and any(path.iterdir()):
             raise FileExistsError(f"the folder {path} exists and holds files. Name another folder with --out, or "
                                   "replace them with --overwrite.")
-        with lasting(path):
+        with open_folder(path):
             yield path
         return
     with _empty_folders_removed(FOLDER) as new_folders:
@@ -42,7 +42,7 @@ def folder(name: str, out: str | None, overwrite: bool) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def lasting(path: Path) -> Iterator[Path]:
+def open_folder(path: Path) -> Iterator[Path]:
     """Make a folder that may hold results; a new folder that stays empty is removed.
 
     Raises:

@@ -62,7 +62,7 @@ from matplotlib.figure import Figure
 
 from lfm_ppl.experiments import scores
 from lfm_ppl.experiments.datasets import TaskKind
-from lfm_ppl.parallel.cluster import Workers, started
+from lfm_ppl.parallel.cluster import Workers, start_workers
 from lfm_ppl.parallel.run import run_tasks
 from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.results.plots import style
@@ -314,7 +314,7 @@ class Study:
         tasks = self.tasks(settings)
         if self.follow_up_tasks is None:
             return self.tabulate(settings, run_all(tasks, workers=workers), tasks)
-        with started(workers) as pool:  # starting workers takes seconds: both rounds share them
+        with start_workers(workers) as pool:  # starting workers takes seconds: both rounds share them
             results = run_all(tasks, workers=pool or 1)
             more_tasks = self.follow_up_tasks(settings, results)
             return self.tabulate(settings, results | run_all(more_tasks, workers=pool or 1), [*tasks, *more_tasks])

@@ -1,6 +1,6 @@
 """Workers by Dask: processes of this machine, or the workers of a scheduler. Dask is imported when it is used.
 
-1. `started` starts a local cluster or connects to a scheduler; Dask restarts dead workers.
+1. `start_workers` starts a local cluster or connects to a scheduler; Dask restarts dead workers.
 2. `compute_on_workers` keeps one task per worker submitted. Dask repeats tasks that fail or whose worker dies.
 3. A worker computes with one thread and the settings of this process, so that the numbers are the same.
 """
@@ -66,7 +66,7 @@ def available() -> int:
 
 
 @contextlib.contextmanager
-def started(workers: Workers, most: int | None = None) -> Iterator[Cluster | None]:
+def start_workers(workers: Workers, most: int | None = None) -> Iterator[Cluster | None]:
     """Start at most ``most`` processes or connect to a scheduler, and close them at the end; None for this process."""
     check_workers(workers)
     if workers == 1:

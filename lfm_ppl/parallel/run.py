@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lfm_ppl.parallel.cluster import Workers, check_workers, compute_on_workers, started
+from lfm_ppl.parallel.cluster import Workers, check_workers, compute_on_workers, start_workers
 from lfm_ppl.parallel.errors import TasksFailedError
 from lfm_ppl.parallel.task import Compute, Computed, Result, Task, compute_task
 from lfm_ppl.utils.progress import Reporter, TaskProgress
@@ -87,7 +87,7 @@ def outcomes(tasks: Iterable[Task], compute: Compute, folder: str | Path | None,
         for stem in list(results):
             if (result := results.pop(stem)) is not None:
                 yield Outcome(by_stem[stem], result, stored=True)
-        cluster = stack.enter_context(started(workers, most=len(missing))) if missing else None
+        cluster = stack.enter_context(start_workers(workers, most=len(missing))) if missing else None
         if cluster is not None:
             progress.write(f"dashboard {cluster.client.dashboard_link}")
         computed = compute_on_workers(cluster, missing, compute) if cluster else _compute_here(missing, compute)

@@ -47,7 +47,7 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     warnings_found = []
     if len(broken):
         warnings_found.append(
-            f"draws are not finite for {listed(list(broken))}: nothing computed from them "
+            f"draws are not finite for {join_names(list(broken))}: nothing computed from them "
             "holds. Tighten the priors, or choose starting values where the model is finite."
         )
     if chains < 2:
@@ -60,7 +60,7 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     high = sound["r_hat"][sound["r_hat"] > MAX_R_HAT].sort_values(ascending=False)
     if len(high):
         warnings_found.append(
-            f"R-hat is above {MAX_R_HAT} for {listed(_with_values(high, '.3f'))}: the chains have "
+            f"R-hat is above {MAX_R_HAT} for {join_names(_with_values(high, '.3f'))}: the chains have "
             "not reached the same distribution. Run longer (warmup, samples); if it stays, look "
             "at the trace plot for several modes and for parameters that the data do not identify."
         )
@@ -110,9 +110,9 @@ def of_degenerate_mode(rows: pd.DataFrame) -> list[str]:
         return []
     values = _with_values(rows["mode"], ".2g") if "mode" in rows else list(rows.index)
     return [
-        f"the posterior mode is degenerate in {listed(values)}: the density has a spike there that holds hardly any "
-        "of the posterior, as where the scale of a group goes to zero and its members become equal, so that the draws "
-        'mean nothing. Sample with NUTS (sampler="nuts"), and write a hierarchical model in non-centred form: '
+        f"the posterior mode is degenerate in {join_names(values)}: the density has a spike there that holds hardly "
+        "any of the posterior, as where the scale of a group goes to zero and its members become equal, so that the "
+        'draws mean nothing. Sample with NUTS (sampler="nuts"), and write a hierarchical model in non-centred form: '
         "theta = mu + tau * z with z ~ Normal(0, 1), or numpyro.infer.reparam.LocScaleReparam(0)."
     ]
 
@@ -161,7 +161,7 @@ def _low_ess(ess: pd.Series, kind: str, part: str, chains: int) -> list[str]:
     factor = math.ceil(minimum / max(low.iloc[0], 1.0))
     return [
         f"{kind} effective sample size is below {minimum} ({MIN_ESS_PER_CHAIN} per chain) for "
-        f"{listed(_with_values(low, '.0f'))}: too little is known of the {part} of the posterior. "
+        f"{join_names(_with_values(low, '.0f'))}: too little is known of the {part} of the posterior. "
         f"Raise samples (or thin) about {factor}-fold, or lower the correlation between parameters."
     ]
 
@@ -170,7 +170,7 @@ def _with_values(values: pd.Series, form: str) -> list[str]:
     return [f"{label} ({value:{form}})" for label, value in values.items()]
 
 
-def listed(names: list[str]) -> str:
+def join_names(names: list[str]) -> str:
     """Return the first names of a list, and the number of the others."""
     more = len(names) - _NAMED
     return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")

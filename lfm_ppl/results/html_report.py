@@ -96,7 +96,7 @@ def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figur
     path = Path(path) / NAME if Path(path).is_dir() else Path(path)
     refuse_existing(path, overwrite)
     attrs = arviz_data.attributes(result)
-    table = tables.annotated(arviz_data.summary(result), result)
+    table = tables.annotate(arviz_data.summary(result), result)
     pictures, failures = _draw_figures(result) if figures is None else (_read(figures), [])
     diagnostics = [name for name in _DIAGNOSTICS if name in table]
     description = str(attrs.get("description", "")).strip()
@@ -150,7 +150,7 @@ def refuse_foreign(path: str | Path, overwrite: bool) -> None:
 @functools.cache
 def _template() -> Template:
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
-    environment.filters |= {"readable": tables.readable, "column_kinds": _column_kinds,
+    environment.filters |= {"format_cells": tables.format_cells, "column_kinds": _column_kinds,
                             "base64": lambda png: base64.b64encode(png).decode("ascii")}
     return environment.from_string(resources.files("lfm_ppl.results").joinpath("report.html.jinja").read_text("utf-8"))
 

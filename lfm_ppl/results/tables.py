@@ -1,6 +1,6 @@
 """Tables for the terminal, Markdown and CSV.
 
-1. `readable` turns a table into text, with a fixed number of significant digits.
+1. `format_cells` turns a table into text, with a fixed number of significant digits.
 2. `text_table` breaks wide tables into blocks that fit the terminal.
 3. Files are written atomically.
 """
@@ -50,7 +50,7 @@ def format_number(value: Any, digits: int = 3) -> str:
     return f"{number:.{max(digits - 1 - exponent, 0)}f}"
 
 
-def readable(frame: pd.DataFrame, digits: int = 3) -> pd.DataFrame:
+def format_cells(frame: pd.DataFrame, digits: int = 3) -> pd.DataFrame:
     """Return a table of text, with numbers as `format_number` gives them."""
     def cell(name: str, value: Any) -> str:
         is_finite = isinstance(value, (float, int, np.number)) and math.isfinite(value)
@@ -77,7 +77,7 @@ def text_table(frame: pd.DataFrame, width: int = 80, digits: int = 3) -> str:
     Returns:
         Lines joined by newlines, without trailing blanks.
     """
-    cells = readable(frame, digits)
+    cells = format_cells(frame, digits)
     # A gap of two spaces is easier to read than a gap of one, which is better than a second block.
     for is_split, gap in ((False, "  "), (True, "  "), (True, " ")):
         names = _padded(["", "", *cells.index], str.ljust)
@@ -121,7 +121,7 @@ def markdown_table(frame: pd.DataFrame, digits: int = 3) -> str:
         | :---- | ----: |
         | decay | 0.500 |
     """
-    cells = readable(frame, digits)
+    cells = format_cells(frame, digits)
     columns = []
     for name, is_numeric in [("", False), *((name, pd.api.types.is_numeric_dtype(frame[name])) for name in frame)]:
         texts = [text.replace("|", "\\|") for text in (str(name), *(cells[str(name)] if name else cells.index))]
@@ -133,7 +133,7 @@ def markdown_table(frame: pd.DataFrame, digits: int = 3) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in zip(*columns, strict=True))
 
 
-def annotated(table: pd.DataFrame, result: Any) -> pd.DataFrame:
+def annotate(table: pd.DataFrame, result: Any) -> pd.DataFrame:
     """Return a summary with the kind of each parameter, and the warnings on its draws.
 
     Args:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from lfm_ppl.results.convergence import listed
+from lfm_ppl.results.convergence import join_names
 from lfm_ppl.results.importance import LARGEST_K
 from lfm_ppl.results.likelihoods import finer_tolerance
 
@@ -168,7 +168,7 @@ def _verdict_from(findings: Findings) -> tuple[str, str, str]:
         return _unreliable(findings)
     shifted = _changed(findings.table)
     if shifted:
-        reason = (f"the Gaussian filter has moved {listed(shifted)}; the importance weights can be relied on "
+        reason = (f"the Gaussian filter has moved {join_names(shifted)}; the importance weights can be relied on "
                   f"(k = {findings.k:.2f}, below {findings.threshold:.2f}), and so can the corrected mean and sd.")
         return "corrected", reason, "lfm-ppl check RESULT --correct --overwrite"
     reason = (f"no mean is off by more than {SHIFT} sd and no sd by more than {WIDTH:.0%}, beyond Monte Carlo error "

@@ -71,7 +71,7 @@ def test_what_a_result_under_constraints_says(sampler):
     bad = result(**base, site_failures="[100, 7, 9]", constraint_weights="[256, 3.0, 1.2]")
     sites, weights = arviz_data.convergence_warnings(bad)
     assert "7 of 100" in sites and "256" in weights and "0.6" in weights
-    for warning in tables.annotated(arviz_data.summary(bad), bad)["warnings"]:
+    for warning in tables.annotate(arviz_data.summary(bad), bad)["warnings"]:
         assert sites in warning and weights in warning
     for few in ("[2, 2.0, 2.0]", "[256, 0.0, 0.0]"):
         assert len(arviz_data.convergence_warnings(result(**base, constraint_weights=few))) == 1

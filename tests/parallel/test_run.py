@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lfm_ppl.parallel import cluster
-from lfm_ppl.parallel.cluster import started
+from lfm_ppl.parallel.cluster import start_workers
 from lfm_ppl.parallel.errors import ClusterError, TasksFailedError
 from lfm_ppl.parallel.run import outcomes, run_tasks
 from lfm_ppl.parallel.task import Task
@@ -25,7 +25,7 @@ from tests.processes import ROOT, is_running, start_python, wait_until
 @pytest.fixture(scope="module")
 def workers():
     """Two worker processes, for all tests of this file."""
-    with started(2) as running:
+    with start_workers(2) as running:
         yield running
 
 

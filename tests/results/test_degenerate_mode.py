@@ -59,7 +59,7 @@ def test_a_group_that_collapses_is_named_everywhere(y, keywords, tmp_path):
     assert message == arviz_data.convergence_warnings(result)[0]
     assert "spread" in message
     assert table["warnings"].to_dict() == {name: "degenerate mode" * (name == "spread") for name in table.index}
-    written = tables.annotated(table, result)["warnings"]
+    written = tables.annotate(table, result)["warnings"]
     assert written["spread"] == message and written["mean"] == ""
     again = lfm.load(lfm.save(result, tmp_path / "posterior.nc"))
     page = lfm.save_report(again, tmp_path, figures=()).read_text()

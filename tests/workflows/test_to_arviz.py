@@ -96,7 +96,7 @@ def test_derived_parameters_and_warnings_are_marked_in_a_file_too(converted, tmp
     assert "derived" not in posterior["decay"].attrs
     said = json.loads(arviz_data.attributes(converted)["warnings"])
     assert said
-    table = tables.annotated(arviz_data.summary(converted), converted)
+    table = tables.annotate(arviz_data.summary(converted), converted)
     assert table.loc["half_life[p21]", "kind"] == "derived"
     assert table.loc["noise_sd", "kind"] == "sampled"
     assert table.loc["noise_sd", "warnings"]
