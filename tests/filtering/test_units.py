@@ -92,9 +92,9 @@ def smoothed(units, known, iterations):
             np.asarray(result.leave_one_out) + unit, np.asarray(result.log_likelihood) + unit)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("units", OTHERS.values(), ids=OTHERS)
-@pytest.mark.parametrize("known, iterations", [(False, 0), (True, 0), (False, 2)])
+@pytest.mark.parametrize("known, iterations", [
+    (True, 0), pytest.param(False, 0, marks=pytest.mark.slow), pytest.param(False, 2, marks=pytest.mark.slow)])
 def test_smoothed_moments_are_those_in_other_units(known, iterations, units):
     mean, covariance, *densities = smoothed(METRIC, known, iterations)
     other_mean, other_covariance, *others = smoothed(units, known, iterations)

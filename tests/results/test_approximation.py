@@ -44,6 +44,7 @@ def fit(**settings):
     return result, messages
 
 
+@pytest.mark.slow
 def test_the_default_likelihood_of_a_positive_force_is_iterated():
     result, messages = fit()
     attrs = arviz_data.attributes(result)
