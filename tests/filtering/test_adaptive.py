@@ -168,3 +168,49 @@ def test_what_a_tolerance_cannot_be():
                   lambda: lfm.smooth(model, TIMES, Y, iterations=3, tolerance=1e-3)):
         with pytest.raises(ValueError, match="tolerance"):
             wrong()
+
+
+class Cascade(eqx.Module):
+    """Each state makes the next one; ``units`` are those of the states."""
+
+    units: Any
+
+    def __call__(self, x, u, t):
+        x = x / self.units
+        made = jnp.concatenate([jax.nn.softplus(u), x[:-1] / (1.0 + x[:-1] ** 2)])
+        return (made - 0.5 * x) * self.units
+
+
+class Last(eqx.Module):
+    """The last state, in its unit."""
+
+    units: Any
+
+    def __call__(self, x, u, t):
+        return x[-1:] / self.units[-1]
+
+
+@pytest.mark.parametrize("units", [
+    pytest.param(np.ones(4), id="alike", marks=pytest.mark.slow),
+    pytest.param(np.array([1e-3, 1e3, 1.0, 30.0]), id="mixed units")])
+def test_a_cascade_from_a_known_zero_in_any_units(units):
+    def log_prob(tolerance, steps):
+        model = lfm.LatentForceModel(
+            Cascade(jnp.asarray(units)), {"u": lfm.Matern(1.0, 2.0)},
+            lfm.GaussianObservation(Last(jnp.asarray(units)), 0.01 * jnp.ones(1)),
+            lfm.Gaussian(np.zeros(4), np.zeros(4)), initial_time=-2.0)
+        return lfm.MarginalLikelihood(model, TIMES, steps=steps, iterations=0, tolerance=tolerance).log_prob(Y)
+
+    exact = log_prob(None, 400)
+    np.testing.assert_allclose(log_prob(1e-3, 30), exact, rtol=2e-2)
+    np.testing.assert_allclose(log_prob(1e-5, 100), exact, rtol=1e-3)
+
+
+
+@pytest.mark.slow
+def test_side_by_side_as_one_by_one():
+    alone = [double_well(p, tolerance=1e-3).log_prob(Y) for p in SLOW_TO_STIFF]
+    together = jax.jit(jax.vmap(lambda p: double_well(p, tolerance=1e-3).log_prob(Y)))(SLOW_TO_STIFF)
+    np.testing.assert_allclose(together, alone, rtol=1e-9)
+    panel = lfm.panel(lambda p: double_well(p).model, SLOW_TO_STIFF, TIMES, steps=60, tolerance=1e-3)
+    np.testing.assert_allclose(panel.log_prob(np.broadcast_to(Y, (4, *Y.shape))), alone, rtol=1e-9)

@@ -1,8 +1,11 @@
 """Observation families of states without variance: log p(y | f) exactly, and the limit of small variances."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 import pytest
 from jax.scipy import stats
 from jax.scipy.special import gammaln
@@ -150,3 +153,61 @@ def test_sites_converge_in_any_unit():
     for unit in (1e-12, 1e-4, 1e4, 1e12):
         assert float(run(unit, 0.0)) == pytest.approx(float(run(1.0, 0.0)), rel=1e-9)
     assert float(run(1.0, 1e9)) == pytest.approx(float(run(1.0, 0.0)), rel=1e-4)
+
+
+ALL = np.stack([COUNTS, COUNTS + 3.0, [1.0, 0.0, 1.0, 1.0, 0.0, 1.0], [9.0, 7.0, 8.0, 5.0, 6.0, 4.0],
+                [4.7, 4.2, 4.1, 4.0, 4.0, 4.0], [4.5, 4.4, 9.0, 3.6, 3.3, 3.2], [1.2, 0.8, 1.0, 2.0, 1.1, 0.4],
+                [4.6, 4.2, 4.1, 3.8, 3.3, 3.2]], axis=1)
+
+
+def without_warnings(run):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return run()
+
+
+def all_families(theta):
+    def state(x, u, t):
+        return x
+
+    noise = jnp.exp(theta[2]) / 4.0
+    return lfm.Observations(
+        lfm.PoissonObservation(state), lfm.NegativeBinomialObservation(state, 5.0 * noise),
+        lfm.BernoulliObservation(lambda x, u, t: x - 4.0), lfm.BinomialObservation(lambda x, u, t: x - 4.0, 10.0),
+        lfm.CensoredObservation(state, noise, left=4.0), lfm.StudentTObservation(state, 4.0, noise),
+        lfm.Observation(lambda x, u, t: x - 4.0, lambda f: dist.Gamma(2.0, jnp.exp(f))),
+        lfm.GaussianObservation(state, noise[None] ** 2))
+
+
+def exact_rows(theta):
+    filled = np.where(np.isnan(ALL), 1.0, ALL)
+    rows = jax.vmap(lambda t, y: law_of_all(theta, theta[1] - theta[0] * t, y))(TIMES, filled)
+    return jnp.where(np.isnan(ALL), 0.0, rows).sum(1)
+
+
+def law_of_all(theta, f, y):
+    """Return log p(y | f) of the same families, from their definitions."""
+    noise, p, limit = jnp.exp(theta[2]) / 4.0, jax.nn.sigmoid(f - 4.0), 4.0
+    mean, c = jnp.exp(f), 5.0 * noise
+    return jnp.stack([
+        y[0] * f - mean - gammaln(y[0] + 1.0),
+        gammaln(y[1] + c) - gammaln(c) - gammaln(y[1] + 1.0) + c * jnp.log(c / (c + mean))
+        + y[1] * jnp.log(mean / (c + mean)),
+        jnp.log(jnp.where(y[2] > 0.5, p, 1.0 - p)),
+        gammaln(11.0) - gammaln(y[3] + 1.0) - gammaln(11.0 - y[3]) + y[3] * jnp.log(p)
+        + (10.0 - y[3]) * jnp.log(1.0 - p),
+        jnp.where(y[4] <= limit, stats.norm.logcdf(limit, f, noise), stats.norm.logpdf(y[4], f, noise)),
+        stats.t.logpdf(y[5], 4.0, f, noise),
+        2.0 * (f - 4.0) + jnp.log(y[6]) - y[6] * jnp.exp(f - 4.0),
+        stats.norm.logpdf(y[7], f, noise)])
+
+
+@pytest.mark.parametrize("sites", [None, pytest.param("variational", marks=pytest.mark.slow),
+                                   pytest.param("laplace", marks=pytest.mark.slow)])
+def test_all_families_add_their_densities(sites):
+    def log_prob(theta):
+        return lfm.MarginalLikelihood(decay(theta, all_families(theta)), TIMES, sites=sites).log_prob(ALL)
+
+    assert without_warnings(lambda: float(log_prob(THETA))) == pytest.approx(float(exact_rows(THETA).sum()), rel=1e-12)
+    gradient = jax.jit(jax.grad(log_prob))(THETA)
+    np.testing.assert_allclose(gradient, jax.grad(lambda theta: exact_rows(theta).sum())(THETA), rtol=1e-10)

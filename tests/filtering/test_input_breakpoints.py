@@ -3,6 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
 from scipy.integrate import solve_ivp
 
@@ -183,3 +185,46 @@ def test_simulations_and_particles_do_not_step_over_pulses():
         process_noise=lambda x, u, t: 1e-8 * (1.0 + jnp.tanh(x) ** 2)[:, None], initial_time=0.0)
     result = lfm.particle_filter(jax.random.key(0), noisy, ROWS, Y[:, None], particles=4, steps=200)
     np.testing.assert_allclose(result.mean[:, 0], exposed(*train, ROWS), rtol=2e-2, atol=1e-2)
+
+
+@pytest.mark.slow
+def test_a_lag_is_learnt():
+    def model(times, y=None):
+        lag = numpyro.sample("lag", dist.LogNormal(0.0, 0.5))
+        numpyro.sample("y", lfm.MarginalLikelihood(system(lambda t: INFUSION(t - lag)), times), obs=y)
+
+    posterior = lfm.fit(model, ROWS, Y[:, None], sampler="map", trajectory_draws=0, progress=False)["posterior"]["lag"]
+    lags = np.linspace(1.2, 1.6, 801)
+    weight = np.exp([closed_form(lag) - 0.5 * (np.log(lag) / 0.5) ** 2 - np.log(lag) for lag in lags])
+    weight /= weight.sum()
+    mean = weight @ lags
+    np.testing.assert_allclose(posterior.mean(), mean, atol=5e-3)
+    np.testing.assert_allclose(posterior.std(), np.sqrt(weight @ (lags - mean) ** 2), rtol=0.15)
+
+
+@pytest.mark.slow
+def test_a_linear_input_at_a_lag():
+    ramp = lfm.Input([-9.0, 0.0, 0.2, 0.5, 99.0], [0.0, 0.0, 4.0, 0.0, 0.0], "linear", "hold")
+
+    def log_prob(lag, steps):
+        model = system(lambda t: ramp(t - lag), lambda x: x / (0.8 + x))
+        return lfm.MarginalLikelihood(model, ROWS, steps=steps, iterations=0).log_prob(Y[:, None])
+
+    value, gradient = jax.value_and_grad(lambda lag: log_prob(lag, 10))(1.37)
+    fine = [log_prob(1.37 + change, 40) for change in (-1e-5, 0.0, 1e-5)]
+    np.testing.assert_allclose(value, fine[1], atol=1e-4)
+    np.testing.assert_allclose(gradient, (fine[2] - fine[0]) / 2e-5, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_smoothing_at_requested_times_with_a_traced_lag():
+    def forced(lag):
+        return lfm.LatentForceModel(
+            lambda x, u, t: INFUSION(t - lag) + jnp.tanh(u) - DECAY * x, {"u": lfm.Matern(0.5, 2.0)},
+            lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.04])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+
+    at = np.linspace(0.0, 14.0, 9)
+    run = lambda lag: tuple(getattr(lfm.smooth(forced(lag), ROWS, Y[:, None], at=at), name)  # noqa: E731
+                            for name in ("mean", "covariance"))
+    for result, expected in zip(jax.jit(run)(1.37), run(1.37), strict=True):
+        np.testing.assert_allclose(result, expected, atol=2e-3)

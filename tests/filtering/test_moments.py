@@ -159,3 +159,13 @@ def test_random_points_with_a_known_state():
                      for rule in (lfm.GaussHermite(9), lfm.MonteCarlo(1000)))
     # The average over 500 pairs of a Jacobian of size 2 is off by some 2 / sqrt(500) at a time.
     assert abs(random / exact - 1) < 0.3
+
+
+@pytest.mark.slow
+def test_steps_are_rows():
+    """The same steps inside one row, where the smoother asks for the flow too."""
+    model = double_well()
+    many = predicted(model, lfm.Cubature(), 10)
+    result = lfm.filter(model, [END], [[0.8]], steps=10)
+    one = np.append(result.predicted_mean, result.predicted_covariance)
+    assert np.abs(many - one).max() < 1e-13

@@ -124,3 +124,26 @@ def test_points_in_the_whole_state_keep_runge_kutta():
                                  lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
                                  process_noise=lambda x, u, t: x[None])
     assert not is_nonlinear_in_forces_only(lfm.state_space(noisy), lfm.Cubature())
+
+
+@pytest.mark.slow
+def test_without_forces(monkeypatch):
+    """Linear dynamics with a noise that varies with time: there are no nodes to linearise about."""
+    def varying():
+        return lfm.LatentForceModel(
+            lambda x, u, t: jnp.cos(t) - x, {}, lfm.GaussianObservation(whole_state, jnp.array([0.1])),
+            lfm.Gaussian(jnp.ones(1), jnp.eye(1)), process_noise=lambda x, u, t: (1.0 + t) * jnp.ones((1, 1)))
+
+    model, same = varying(), varying()  # of functions of their own, in which nothing is compiled yet
+    assert is_nonlinear_in_forces_only(lfm.state_space(model), lfm.Cubature())
+
+    def log_likelihoods(model):
+        return [lfm.MarginalLikelihood(model, np.arange(4.0), steps=3, iterations=count).log_prob(jnp.ones((4, 1)))
+                for count in (0, 2)]
+
+    result = log_likelihoods(model)
+    assert lfm.smooth(model, np.arange(4.0), np.ones((4, 1)), at=[0.5, 3.5], steps=3, iterations=2).mean.shape == (2, 1)
+    asked = []
+    monkeypatch.setattr(predict, "is_nonlinear_in_forces_only", lambda *_: bool(asked.append(None)))
+    np.testing.assert_allclose(result, log_likelihoods(same), rtol=1e-12)
+    assert asked, "compiled anew, without Simpson's rule"
