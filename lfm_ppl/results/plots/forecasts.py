@@ -22,7 +22,7 @@ from lfm_ppl.results.predictions import GROUP, HELD_OUT, INTERVAL, MEAN, interva
 NOISE_FREE, PREDICTIVE = "#8FBFDE", "#D3E4F1"
 """Tints of blue: bands of noise-free outputs and of new data."""
 
-_CURVES = 40  # predictions from which they are drawn as curves
+_CURVES = 12  # predictions from which they are drawn as curves
 _LONGEST_GAP = 3.0  # usual gaps between predictions that a curve crosses; nights without rows are longer
 _SMALLEST_SHARE, _FEWEST_ROWS = 0.2, 20
 """Share of the axis below which a forecast gets a third of it, and rows that are shown before it at least."""
