@@ -6,6 +6,7 @@ import re
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.inference.handlers.pinned import Pinned
@@ -69,13 +70,13 @@ def _interval_in_words(distribution: Any, entries: Any = ...) -> str:
     if base.support.is_discrete:
         return _in_words(base)
     try:
-        quantiles = [np.asarray(base.icdf(probability)) for probability in _INTERVAL]
+        quantiles = np.asarray(_quantiles(base))
     except (NotImplementedError, ImportError, AttributeError):  # no closed form: draws give two digits
         try:
             draws = base.sample(jax.random.key(0), (_DRAWS,))
         except NotImplementedError:  # an improper prior
             return _in_words(base)
-        quantiles = [_rounded(value) for value in np.quantile(draws, _INTERVAL, axis=0)]
+        quantiles = np.vectorize("{:.2g}".format)(np.quantile(draws, _INTERVAL, axis=0)).astype(float)
     median, low, high = (_number(np.broadcast_to(value, distribution.shape())[entries]) for value in quantiles)
     return f"median {median}, 95% {low} to {high} ({type(base).__name__})"
 
@@ -86,7 +87,11 @@ _INTERVAL = (0.5, 0.025, 0.975)
 _DRAWS = 20_000
 """Number of draws for the quantiles of a prior without closed form."""
 
-_rounded = np.vectorize(lambda value: float(f"{value:.2g}"), otypes=[float])
+
+@jax.jit
+def _quantiles(distribution: Any) -> jax.Array:
+    """Return the quantiles (3, ...); compiled, because `fit_many` describes the same priors for each data set."""
+    return jax.vmap(distribution.icdf)(jnp.array(_INTERVAL))
 
 
 def _unwrapped(distribution: Any) -> Any:
