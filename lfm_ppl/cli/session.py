@@ -71,10 +71,10 @@ def _add_missing_stamps(folder: Path) -> None:
 
     JAX 0.10 caches nothing more after one program without it (``jax/_src/lru_cache.py``).
     """
-    for program in folder.glob("*-cache"):
-        stamp = program.with_name(program.name.removesuffix("-cache") + "-atime")
-        if not stamp.exists():
-            stamp.write_bytes(bytes(8))
+    names = set(os.listdir(folder))
+    programs = (name.removesuffix("-cache") for name in names if name.endswith("-cache"))
+    for stamp in {f"{program}-atime" for program in programs} - names:
+        (folder / stamp).write_bytes(bytes(8))
 
 
 def _cpu() -> str:
