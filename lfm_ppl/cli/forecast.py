@@ -25,7 +25,7 @@ from lfm_ppl.cli.options import ForecastOptions, Times
 from lfm_ppl.cli.requested_times import requested_times
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
-from lfm_ppl.io.data_set import Data, InputTable, on_clock_of
+from lfm_ppl.io.data_set import Data, InputTable, at_origin
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.results import arviz_data, files, inputs, plots, tables
 from lfm_ppl.results.plots.trajectories import trajectory_names
@@ -112,8 +112,10 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
     if (read.origin is None) != (observed.origin is None):
         kinds = ("plain numbers", "dates") if read.origin is None else ("dates", "plain numbers")
         raise ValueError(f"{path}: its times are {kinds[0]}, the times of the result {kinds[1]}; use the same form.")
-    read = on_clock_of(dataclasses.replace(read, outputs=observed.outputs, inputs={
-        name: read.inputs[column] for name, (column, _) in columns.items()}), observed)
+    read = dataclasses.replace(read, outputs=observed.outputs, inputs={
+        name: read.inputs[column] for name, (column, _) in columns.items()})
+    if observed.origin is not None:
+        read = at_origin(read, observed.origin, observed.units["time"])
     if repeated_rows := int(np.isin(read.times, observed.times).sum()):
         print(f"note     {repeated_rows} of {len(read.times)} rows of {path} are at times of the fitted data: if they "
               "are the same data, their scores are not scores of a forecast")

@@ -136,13 +136,6 @@ def model_keywords(tables: Mapping[str, InputTable], model_kwargs: Mapping[str, 
     return {**({"inputs": as_inputs(tables)} if tables else {}), **(model_kwargs or {})}
 
 
-def on_clock_of(data: Data, reference: Data) -> Data:
-    """Return data with their times counted from the origin of other data, in their unit."""
-    if (data.origin is None) != (reference.origin is None):
-        raise ValueError("the times of two tables cannot be compared: they are dates in one and numbers in the other.")
-    return data if reference.origin is None else at_origin(data, reference.origin, reference.units["time"])
-
-
 def at_origin(data: Data, origin: str, unit: str) -> Data:
     """Return data, whose times were dates, with their times counted from another origin, in another unit."""
     ratio = calendar_time.SECONDS[data.units["time"]] / calendar_time.SECONDS[unit]
