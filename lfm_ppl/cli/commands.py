@@ -78,6 +78,7 @@ def parse(line: Sequence[str]) -> tuple[Callable[..., int | None], inspect.Bound
     if not words:
         raise ValueError("name a command; `lfm-ppl --help` lists them.")
     if words[0] == "compare":
+        # A folder may have the name of a study. Study options may stand before the name, so that no parser finds it.
         positions = [index for index, word in enumerate(words) if word.replace("_", "-") in catalogue.names()
                      and words[index - 1] not in ("--out", "--data")]
         if positions:  # options may stand before the name

@@ -7,8 +7,8 @@ likelihood of ``u[7]`` is finite for a model of one force.
 2. `_walk` yields the equations of a jaxpr and of the functions it calls, with the values of operands that are
    constants, known arguments, or computed from these.
 3. `TracedFunction.check_indices` compares known indices of slices, gathers and scatters with the shapes of the arrays.
-   (`jax.experimental.checkify` would also refuse indices whose ``mode`` defines the result out of range, and indices
-   that depend on the values of x, u, t or traced parameters, which are not known here.)
+   (`jax.experimental.checkify` needs the values of x, u, t and the parameters, which are not known here: at zeros it
+   would refuse an index such as ``floor(t) - 100``.)
 4. `TracedFunction.table_reads` lists the reads of known inputs (`lfm_ppl.model.inputs`).
 
 Source: https://docs.jax.dev/en/latest/jaxpr.html for the structure of jaxprs.

@@ -153,8 +153,8 @@ def fit(
 
     Ctrl-C ends the sampling after the present block of steps, about two seconds. With a ``checkpoint`` the finished
     draws are returned, with an attribute ``partial`` and a warning; without one they are the attribute ``result`` of
-    the KeyboardInterrupt. A second Ctrl-C does not wait for the end of the block. Both
-    wait for compiled code that is running, such as a compilation.
+    the KeyboardInterrupt. A second Ctrl-C does not wait for the end of the block. Both wait for compiled code that is
+    running, and for a compilation.
 
     Returns:
         An ArviZ object (``InferenceData`` on ArviZ 0.23, ``xarray.DataTree`` on 1.x) with the groups

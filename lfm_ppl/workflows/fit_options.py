@@ -136,8 +136,8 @@ def describe_assumptions(bound: BoundModel) -> str:
         warnings.simplefilter("ignore")  # a draw of the prior may be extreme
         another = bound.likelihood({name: _draw(trace[name]["fn"], trace[name]["value"]) for name in bound.sites})
     example = another.first if isinstance(another, Panel) else another
-    others = assumptions(example.ssm.model)
-    return json.dumps({topic: without_parameters(description, others[topic])
+    descriptions = assumptions(example.ssm.model)
+    return json.dumps({topic: without_parameters(description, descriptions[topic])
                        for topic, description in assumptions(bound.site.example.ssm.model).items()})
 
 
