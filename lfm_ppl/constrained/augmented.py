@@ -216,7 +216,7 @@ def _replace_observation(model: LatentForceModel, observation: GaussianObservati
     return state_space(LatentForceModel(
         model.dynamics, tuple(model.forces.items()), observation, model.initial_state, model.process_noise,
         model.initial_time, model.nonlinear_inputs, model.state_names, (*model.output_names, *constraints.labels),
-        model.units))
+        model.units, events=model.events))
 
 
 def augmented_observations(y: jax.Array, targets: jax.Array, rows: Rows) -> jax.Array:

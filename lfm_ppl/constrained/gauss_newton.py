@@ -112,7 +112,7 @@ class ConstrainedDynamics:
     def __init__(self, problem: ConstrainedProblem):
         self.problem, self.ssm = problem, problem.ssm
         self.filter_problem = filter_problem(problem.ssm, Taylor(), problem.grid)
-        self.intervals = as_arrays(problem.grid.intervals)
+        self.intervals = as_arrays(self.filter_problem.grid.intervals)
 
     def predict(self, interval: Any, state: jax.Array, with_map: bool) -> Any:
         """Return the prediction over an interval from a state (n,) without uncertainty."""

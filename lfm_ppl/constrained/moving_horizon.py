@@ -291,6 +291,8 @@ def _build_settings(model: LatentForceModel, constraints: Constraints, window: i
     filter_ssm = state_space(model)
     if filter_ssm.stack.jump_times:
         raise ValueError("a moving window does not support forces that jump at given times; leave out their jumps.")
+    if model.events:
+        raise ValueError("a moving window does not support events; leave them out, or take lfm.full_information.")
     index = np.arange(window)
     ssm = augmented_model(model, constraints, Rows(index, index, index, np.zeros(window, int)))
     linear = is_linear(ssm)

@@ -82,7 +82,8 @@ def backward(problem: FilterProblem, trace: FilterTrace, adjoint_only: bool = Fa
             and zero.
     """
     intervals = problem.grid.intervals
-    is_empty = (jnp.asarray(intervals.length) == 0) & (jnp.asarray(intervals.jump) < 0)
+    is_empty = ((jnp.asarray(intervals.length) == 0) & (jnp.asarray(intervals.jump) < 0)
+                & (jnp.asarray(intervals.event) < 0))
     start = at_interval_starts(trace.filtered, trace.initial)
     size = trace.initial.mean.shape[0]
 

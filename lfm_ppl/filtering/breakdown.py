@@ -155,7 +155,7 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
     rows = jax.tree.map(np.asarray, grid.intervals)
     previous = start if row == 0 else Moments(trace.filtered.mean[row - 1], trace.filtered.covariance[row - 1])
     count = 1 if ssm.time_invariant or grid.tolerance is not None else grid.steps
-    interval = Intervals(*(column[row:row + 1] for column in rows))
+    interval: Intervals = jax.tree.map(lambda column: column[row:row + 1], rows)
     stepwise = _run_filter(ssm, rule, _divide_interval(grid, interval, count), y, previous)
     step = _first_bad_row(stepwise)
     # Separate steps differ by rounding, and need not break down.
@@ -182,7 +182,8 @@ def _divide_interval(grid: TimeGrid, interval: Intervals, count: int) -> TimeGri
     is_last = index == count - 1
     start = interval.start + index * length
     intervals = intervals_between(start, np.append(start[1:], interval.end), length,
-                                  np.where(is_last, interval.observation, -1), np.where(is_last, interval.jump, -1))
+                                  np.where(is_last, interval.observation, -1), np.where(is_last, interval.jump, -1),
+                                  event=np.where(is_last, interval.event, -1))
     last = np.array([count - 1])
     return grid._replace(intervals=intervals, lengths=None, steps=1 if grid.tolerance is None else grid.steps,
                          observed=last, requested=last, requested_times=interval.start, replicated=False)

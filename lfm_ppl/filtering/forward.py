@@ -3,7 +3,7 @@ r"""The forward scan: filtered moments and log likelihoods, for any rule and any
 For each interval of the time grid, in one fused scan,
 
 1. predict the moments over the interval: by its exact transition, by integration, or by a given affine map;
-2. let the forces jump, where they do;
+2. let the forces jump, where they do, and apply the event at its end;
 3. linearise the observation about the predicted moments, or about given ones;
 4. update the moments by an `Updater`: a Gaussian observation, Gaussian sites, or sites by moment matching;
 5. record what the caller asks for (`Record`).
@@ -27,6 +27,7 @@ from lfm_ppl.filtering.intervals import Intervals, as_arrays, with_observations
 from lfm_ppl.filtering.moments import Moments, Prediction, Record
 from lfm_ppl.filtering.predict import (
     StepRecord,
+    apply_event,
     apply_jump,
     identity_prediction,
     jump_map,
@@ -170,7 +171,7 @@ def _recorded_update(update: Update, record: Record) -> Update:
 
 def predict(problem: FilterProblem, interval: Intervals, moments: Moments, about: Moments | None = None,
             record: Record = Record.LIKELIHOOD) -> Prediction:
-    """Predict over an interval, a jump at its end included.
+    """Predict over an interval, a jump or an event at its end included.
 
     Args:
         problem: the model, the rule and the time grid.
@@ -204,19 +205,21 @@ def predict(problem: FilterProblem, interval: Intervals, moments: Moments, about
         prediction = jax.lax.cond(interval.length > 0, integrate, keep_moments)
     else:
         prediction = integrate()
+    has_map = record is Record.SMOOTHER or ssm.time_invariant
     if shared.jumps is not None:
-        has_map = record is Record.SMOOTHER or ssm.time_invariant
         prediction = apply_jump(prediction, jump_map(ssm, shared.jumps, interval.jump), has_map)
-    return prediction
+    return prediction if interval.state_map is None else apply_event(prediction, interval.state_map, has_map)
 
 
 def _collect_nodes(problem: FilterProblem, interval: Intervals, prediction: Prediction) -> Prediction:
-    """Reduce the recorded steps to a `NodeRecord`, and set phi of the interval, a jump at its end included."""
+    """Reduce the recorded steps to a `NodeRecord`, and set phi of the interval, jumps at its end included."""
     ssm = problem.ssm
     steps: StepRecord = prediction.nodes
     to_end = jnp.eye(ssm.state_dim)
     if problem.shared.jumps is not None:
         to_end, _ = jump_map(ssm, problem.shared.jumps, interval.jump)
+    if interval.state_map is not None and interval.state_map.keep is not None:
+        to_end = interval.state_map.keep[:, None] * to_end
 
     def previous_step(to_end: jax.Array, step: tuple) -> tuple[jax.Array, jax.Array]:
         covariance, phi = step

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.model.state_space import Span, inset
+from lfm_ppl.model.state_space import Span, StateSpaceModel, inset
 
 
 class Intervals(NamedTuple):
@@ -24,6 +24,8 @@ class Intervals(NamedTuple):
         length_index: (N,) index of its length in `TimeGrid.lengths`; zero where that is None.
         end: (N,) time at which the interval ends, exactly the time of its observation.
         inset: (N,) how far inside of the interval functions of time are evaluated at its ends, see `Span`.
+        event: (N,) index of the event of the model at its end, before the observation; -1 where there is none.
+        state_map: the maps of these events; None where they are not needed, or without events.
     """
 
     start: Any
@@ -33,6 +35,8 @@ class Intervals(NamedTuple):
     length_index: Any
     end: Any
     inset: Any
+    event: Any
+    state_map: Any = None
 
     @property
     def span(self) -> Span:
@@ -41,10 +45,11 @@ class Intervals(NamedTuple):
 
 
 def intervals_between(start: Any, end: Any, length: Any, observation: Any, jump: Any, length_index: Any = None,
-                      scale: Any = 0.0) -> Intervals:
+                      scale: Any = 0.0, event: Any = None) -> Intervals:
     """Return intervals; arguments as in `Intervals`, and ``scale`` as in `lfm_ppl.model.state_space.inset`."""
     length_index = np.zeros(np.shape(length), int) if length_index is None else length_index
-    return Intervals(start, length, observation, jump, length_index, end, inset(start, end, length, scale))
+    event = np.full(np.shape(length), -1) if event is None else event
+    return Intervals(start, length, observation, jump, length_index, end, inset(start, end, length, scale), event)
 
 
 class TimeGrid(NamedTuple):
@@ -79,6 +84,16 @@ class TimeGrid(NamedTuple):
 def as_arrays(intervals: Intervals) -> Intervals:
     """Return the intervals as JAX arrays, which a scan can run over."""
     return jax.tree.map(jnp.asarray, intervals)
+
+
+def with_state_maps(ssm: StateSpaceModel, grid: TimeGrid) -> TimeGrid:
+    """Return the grid with the maps of the events at the ends of its intervals."""
+    maps = ssm.state_maps()
+    if maps is None:
+        return grid
+    # Gathered outside of the scan: its derivative with respect to the amounts is then linear in the number of events.
+    index = jnp.asarray(grid.intervals.event)
+    return grid._replace(intervals=grid.intervals._replace(state_map=jax.tree.map(lambda a: a[index], maps)))
 
 
 class _LengthTable:

@@ -133,7 +133,7 @@ def smoothed_points(problem: FilterProblem, trace: FilterTrace, smoothed: Smooth
     ssm, grid = problem.ssm, problem.grid
     indices = linearization_indices(ssm, problem.rule)
     r, adjoint = smoothed.adjoint
-    has_jumps = problem.shared.jumps is not None
+    has_jumps = problem.has_jumps
 
     def smooth_row(moments: Moments, cross: jax.Array, r: jax.Array, adjoint: jax.Array) -> Moments:
         return Moments(moments.mean + matvec(cross, r), moments.covariance - congruence(cross, adjoint))

@@ -4,7 +4,7 @@
 2. Any other model takes equal steps: Simpson's rule if only the forces enter non-linearly (`simpson`), else the
    covariance-preserving Runge-Kutta method (`runge_kutta`); or steps that follow a tolerance (`adaptive`).
 3. About given linearisation points the prediction is an affine map, which is stored or composed.
-4. A jump of a force at the end of the interval is one more affine map.
+4. A jump of a force, or an event, at the end of the interval is one more affine map.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from lfm_ppl.filtering.runge_kutta import runge_kutta_step
 from lfm_ppl.filtering.simpson import apply_step_map, insert_midpoints, step_maps
 from lfm_ppl.filtering.transition import Exact, IntegratingFactor, LinearPart, integrating_factor
 from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.events import StateMap
 from lfm_ppl.model.state_space import Span, StateSpaceModel
 from lfm_ppl.utils.linalg import matmul
 
@@ -173,6 +174,19 @@ def apply_jump(prediction: Prediction, jump: tuple[Any, Any], has_map: bool) -> 
         return prediction
     phi, process_cov = compose((prediction.phi, prediction.process_cov), jump)
     return prediction._replace(phi=phi, process_cov=process_cov)
+
+
+def apply_event(prediction: Prediction, state_map: StateMap, has_map: bool) -> Prediction:
+    """Return the prediction after an event at the end of the interval; its map, too, if it has one."""
+    mean, covariance = prediction.moments
+    keep, mean = state_map.keep, state_map.apply(mean)
+    if keep is None:
+        return prediction._replace(moments=Moments(mean, covariance))
+    both = keep[:, None] * keep
+    prediction = prediction._replace(moments=Moments(mean, both * covariance))
+    if not has_map:
+        return prediction
+    return prediction._replace(phi=keep[:, None] * prediction.phi, process_cov=both * prediction.process_cov)
 
 
 def predict_by_map(moments: Moments, phi: jax.Array, process_cov: jax.Array, point: jax.Array,

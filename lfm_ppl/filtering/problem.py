@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.dynamics import Dynamics
-from lfm_ppl.filtering.intervals import Intervals, TimeGrid, by_length
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid, by_length, with_state_maps
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.predict import interval_factor
 from lfm_ppl.filtering.transition import LinearPart, constant_jacobian, exact, linear_part
@@ -55,6 +55,11 @@ class FilterProblem(NamedTuple):
     shared: SharedTransitions
 
     @property
+    def has_jumps(self) -> bool:
+        """Whether the state may jump at the end of an interval."""
+        return self.shared.jumps is not None or bool(self.ssm.model.events)
+
+    @property
     def dynamics(self) -> Dynamics:
         """Model, rule and linear part, as a prediction needs them."""
         return Dynamics(self.ssm, self.rule, self.shared.linear)
@@ -79,7 +84,7 @@ def filter_problem(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> FilterPr
 
     shared = SharedTransitions(linear, _observation_jacobian(ssm, grid), by_length(grid, transition),
                                ssm.stack.jump_table())
-    return FilterProblem(ssm, rule, grid, shared)
+    return FilterProblem(ssm, rule, with_state_maps(ssm, grid), shared)
 
 
 def _observation_jacobian(ssm: StateSpaceModel, grid: TimeGrid) -> jax.Array:

@@ -1,12 +1,13 @@
 """The time grid: the intervals of the scans, decided before compilation.
 
 1. Subtract the initial time in float64 on the host, so that results do not depend on the origin of time.
-2. End an interval at each observation, each jump of a force, each requested time and each breakpoint of a known input.
+2. End an interval at each observation, jump of a force, event, requested time and breakpoint of a known input. At equal
+   times jumps of forces come first, then events before the observation, the observation, and all other events.
 3. Divide an interval into as many steps as its length and the longest step need; a part between two breakpoints or
    requested times takes its share of the steps.
 4. All intervals have the same number of steps, chosen to minimise the cost; a long part is several intervals.
 5. Group the lengths of the intervals, up to their rounding, so that their transitions are tabulated.
-6. Breakpoints at a traced lag are merged into the intervals by sorting.
+6. Breakpoints and events at a traced lag are merged into the intervals by sorting.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.intervals import TimeGrid, intervals_between
+from lfm_ppl.model.events import EventTable, event_table
 from lfm_ppl.model.inputs import InputRead, breakpoints_within
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, inset
 from lfm_ppl.utils import checks
@@ -39,6 +41,9 @@ _REPLICATED = 0.2
 LONGEST_FORECAST = 10_000
 """Largest number of intervals of a forecast, each as long as the usual distance of two observations."""
 
+_BEFORE_JUMP, _JUMP, _EVENT_BEFORE, _OBSERVATION, _EVENT_AFTER = range(5)
+"""Order of what happens at one time."""
+
 _MOST_STEPS = 20.0
 """Bound on the number of steps with the default longest step, as a multiple of the number without one."""
 
@@ -49,7 +54,7 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
     """Lay out the intervals of the scan.
 
     Args:
-        ssm: the model; the jumps of its forces, and the jumps and kinks of its known inputs, end intervals.
+        ssm: the model; its events, the jumps of its forces, and the jumps and kinks of its known inputs end intervals.
         times: (T,) observation times, non-decreasing.
         steps: integration steps between two consecutive times.
         max_step: longest step; a longer interval gets more steps, in intervals of ``steps`` each. None: see
@@ -61,7 +66,7 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
 
     Raises:
         ValueError, TypeError: see `lfm_ppl.model.state_space.check_times`; non-positive steps or tolerance; a requested
-            time before the initial time; traced times where concrete ones are needed.
+            time or an event before the initial time; traced times where concrete ones are needed.
     """
     checks.positive_integer("steps", steps, "It is the number of integration steps between two times.")
     checks.refuse_dates("at", requested_times)
@@ -69,6 +74,9 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         checks.positive("max_step", max_step)
     if tolerance is not None:
         checks.positive("tolerance", tolerance)
+    events = event_table(ssm.model.events)
+    if initial_time is not None:
+        events = events.after(initial_time)
     initial_time = ssm.model.initial_time if initial_time is None else initial_time
     concrete_times = check_times(times, initial_time)
     start = concrete_times[0] if initial_time is None and concrete_times is not None else initial_time
@@ -76,18 +84,18 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
     is_adaptive = tolerance is not None
     if concrete_times is None or origin is None:
         division = Division(steps, max_step, interval_per_step, is_adaptive)
-        grid = _traced_grid(ssm, times, initial_time, requested_times, division)
+        grid = _traced_grid(ssm, times, initial_time, requested_times, division, events)
     else:
         longest = max_step
         if max_step is None and not is_adaptive:
             longest = longest_step(ssm, concrete_times, float(origin), steps)
         division = Division(steps, longest, interval_per_step, is_adaptive)
-        grid = _concrete_grid(ssm, concrete_times, float(origin), requested_times, division)
+        grid = _concrete_grid(ssm, concrete_times, float(origin), requested_times, division, events)
     return grid if tolerance is None else grid._replace(tolerance=float(tolerance))
 
 
 def _concrete_grid(ssm: StateSpaceModel, times: np.ndarray, origin: float, requested_times: Any,
-                   division: Division) -> TimeGrid:
+                   division: Division, events: EventTable) -> TimeGrid:
     """Return the time grid for times that are known before compilation."""
     requested = None if requested_times is None else _requested_times(requested_times, origin)
     end = float(times[-1] if requested is None else requested.max(initial=times[-1]))
@@ -95,21 +103,23 @@ def _concrete_grid(ssm: StateSpaceModel, times: np.ndarray, origin: float, reque
     reads = ssm.model.input_reads(origin, end)
     breakpoints, traced_breakpoints = breakpoints_within(reads, origin, end)
     division = replace(division, 
-        breakpoints=breakpoints, traced_breakpoints=len(traced_breakpoints), scale=_time_scale(reads),
+        breakpoints=breakpoints, traced_breakpoints=len(traced_breakpoints) + int(events.is_traced.sum()),
+        scale=_time_scale(reads),
         overhead=_OVERHEAD_OF_EXACT if ssm.time_invariant else _OVERHEAD,
         is_exact=ssm.mean_invariant and division.max_step is None and not division.interval_per_step)
-    grid = _divide_times(times, origin, ssm.stack.jump_times, requested, division)
-    return _insert_traced_breakpoints(grid, traced_breakpoints, division.scale)
+    events.check_start(origin)
+    grid = _divide_times(times, origin, ssm.stack.jump_times, requested, division, events)
+    return _insert_traced_times(grid, traced_breakpoints, events, events.is_traced, division.scale)
 
 
 def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_times: Any,
-                 division: Division) -> TimeGrid:
+                 division: Division, events: EventTable) -> TimeGrid:
     """Return the time grid for times, or an initial time, that are traced."""
     concrete_times = check_times(times, initial_time)
     span = (0.0, 1.0) if concrete_times is None else (float(concrete_times[0]), float(concrete_times[-1]))
     reads = ssm.model.input_reads(*span)
     breakpoints = jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
-    division = replace(division, traced_breakpoints=len(breakpoints), scale=_time_scale(reads))
+    division = replace(division, traced_breakpoints=len(breakpoints) + len(events.times), scale=_time_scale(reads))
     jumps, steps = ssm.stack.jump_times, division.steps
     if concrete_times is not None and jumps and division.max_step is None and requested_times is None:
         grid = _grid_from_traced_origin(concrete_times, initial_time, jumps, steps, division.interval_per_step)
@@ -122,8 +132,8 @@ def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_
         grid = _grid_from_traced_times(times, -(-steps // part), part, initial_time)
     intervals = grid.intervals
     inner = inset(intervals.start, intervals.end, intervals.length, division.scale)
-    return _insert_traced_breakpoints(grid._replace(intervals=intervals._replace(inset=inner)), breakpoints,
-                                      division.scale)
+    return _insert_traced_times(grid._replace(intervals=intervals._replace(inset=inner)), breakpoints, events,
+                                np.full(len(events.times), True), division.scale)
 
 
 @dataclass(frozen=True)
@@ -136,7 +146,7 @@ class Division:
         interval_per_step: whether every step is an interval.
         is_adaptive: whether the length of steps follows the moments.
         breakpoints: times at which known inputs jump or have a kink.
-        traced_breakpoints: number of such times that are traced.
+        traced_breakpoints: number of such times, and of events, that are traced.
         overhead: cost of an interval besides its steps, in steps.
         is_exact: whether the transition over any interval is exact, so that an interval needs no steps.
         scale: see `lfm_ppl.model.state_space.inset`.
@@ -190,28 +200,38 @@ def _time_scale(reads: Sequence[InputRead]) -> Any:
     return sum(sizes) if sizes else 0.0
 
 
-def _insert_traced_breakpoints(grid: TimeGrid, breakpoints: Any, scale: Any) -> TimeGrid:
-    """Return a time grid whose intervals end at traced breakpoints (K,) as well.
+def _insert_traced_times(grid: TimeGrid, breakpoints: Any, events: EventTable, is_inserted: np.ndarray,
+                         scale: Any) -> TimeGrid:
+    """Return a time grid whose intervals end at traced breakpoints (K,) and at some of the events (E,) as well.
 
-    Their number is that of all breakpoints, wherever they lie: those outside of the grid's times end intervals of
-    length zero. The sorted times are continuous in the breakpoints, and differentiable but where two meet.
+    Their number is that of all breakpoints and events, wherever they lie: those outside of the grid's times end
+    intervals of length zero, and such events do not happen. The sorted times are continuous in the inserted times, and
+    differentiable but where two meet.
     """
-    if not np.shape(breakpoints)[0]:
+    index = np.flatnonzero(is_inserted)
+    count = np.shape(breakpoints)[0]
+    if not count + len(index):
         return grid
+    times = events.times if events.traced_times is None else events.traced_times
+    breakpoints = jnp.concatenate([breakpoints, jnp.asarray(times)[index]])
     intervals, origin = grid.intervals, jnp.asarray(grid.initial_time, float)
     since_end = jnp.append(jnp.asarray(grid.since)[1:], jnp.asarray(grid.since)[-1] + intervals.length[-1])
     inserted = jnp.clip(breakpoints - origin, 0.0, since_end[-1])
     merged = jnp.concatenate([since_end, inserted])
-    order = jnp.argsort(jax.lax.stop_gradient(merged), stable=True)
+    rank = np.concatenate([np.full(np.shape(since_end), _OBSERVATION), np.full(count, _EVENT_AFTER),
+                           np.where(events.observation_first[index], _EVENT_AFTER, _EVENT_BEFORE)])
+    order = jnp.lexsort((rank, jax.lax.stop_gradient(merged)))
     position = jnp.argsort(order)
     since_end = merged[order]
     since = jnp.concatenate([jnp.zeros(1), since_end[:-1]])
     end = jnp.concatenate([jnp.asarray(intervals.end), origin + inserted])[order]
     start = jnp.concatenate([jnp.reshape(origin, (1,)), end[:-1]])
-    no_index = np.full(np.shape(breakpoints)[0], -1)
-    observation, jump = (jnp.concatenate([jnp.asarray(a), no_index])[order]
-                         for a in (intervals.observation, intervals.jump))
-    intervals = intervals_between(start, end, since_end - since, observation, jump, scale=scale)
+    no_index = np.full(count + len(index), -1)
+    inserted_event = jnp.where(breakpoints - origin == inserted, np.append(no_index[:count], index), -1)
+    observation, jump, event = (
+        jnp.concatenate([jnp.asarray(a), b])[order]
+        for a, b in ((intervals.observation, no_index), (intervals.jump, no_index), (intervals.event, inserted_event)))
+    intervals = intervals_between(start, end, since_end - since, observation, jump, scale=scale, event=event)
     return grid._replace(intervals=intervals, lengths=None, observed=position[jnp.asarray(grid.observed)],
                          requested=position[jnp.asarray(grid.requested)], since=since)
 
@@ -281,10 +301,10 @@ def _grid_from_traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float,
 
 
 def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], requested_times: np.ndarray | None,
-                  division: Division) -> TimeGrid:
+                  division: Division, events: EventTable) -> TimeGrid:
     """Return the intervals between concrete times.
 
-    1. An interval ends at each observation and at each jump of a force after the initial time.
+    1. An interval ends at each observation, at each event, and at each jump of a force after the initial time.
     2. Breakpoints of known inputs and requested times divide these intervals, and their steps with them.
     3. Each part gets as many intervals of equal length as its steps need.
     """
@@ -297,15 +317,17 @@ def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], re
     # A particle smoother looks at each step: a jump has an interval of its own, so that the state just before it is a
     # node.
     before_jump = jump_time if division.interval_per_step else jump_time[:0]
-    time = np.concatenate([before_jump, jump_time, times])
-    # At equal times a jump comes before an observation.
-    rank = np.repeat([0, 1, 2], [len(before_jump), len(jump_time), len(times)])
-    observation = np.full(len(time), -1)
-    observation[rank == 2] = np.arange(len(times))
-    jump = np.full(len(time), -1)
-    jump[rank == 1] = jump_index
+    event_index = np.flatnonzero(events.times <= end)
+    event_rank = np.where(events.observation_first[event_index], _EVENT_AFTER, _EVENT_BEFORE)
+    time = np.concatenate([before_jump, jump_time, times, events.times[event_index]])
+    rank = np.append(np.repeat([_BEFORE_JUMP, _JUMP, _OBSERVATION], [len(before_jump), len(jump_time), len(times)]),
+                     event_rank)
+    observation, jump, event = (np.full(len(time), -1) for _ in range(3))
+    observation[rank == _OBSERVATION] = np.arange(len(times))
+    jump[rank == _JUMP] = jump_index
+    event[len(time) - len(event_index):] = event_index
     order = np.lexsort((observation, rank, time))
-    time, observation, jump = time[order], observation[order], jump[order]
+    time, rank, observation, jump, event = (a[order] for a in (time, rank, observation, jump, event))
     whole_lengths = np.diff(time, prepend=origin)
     separate = _separate_breakpoints(division.breakpoints, np.sort(np.concatenate([[origin], time, extra])),
                                      division.scale)
@@ -316,32 +338,35 @@ def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], re
         cuts = np.bincount(index, minlength=len(time) + 1)
         # After the last observation a whole interval is as long as the usual distance of two observations.
         whole_lengths = np.append(whole_lengths, _forecast_interval(times, float(cut[-1] - time[-1])))
-        time, observation, jump, whole_lengths, cuts = (np.insert(a, index, b) for a, b in (
-            (time, cut), (observation, -1), (jump, -1), (whole_lengths, whole_lengths[index]), (cuts, cuts[index])))
+        time, rank, observation, jump, event, whole_lengths, cuts = (np.insert(a, index, b) for a, b in (
+            (time, cut), (rank, _OBSERVATION), (observation, -1), (jump, -1), (event, -1),
+            (whole_lengths, whole_lengths[index]), (cuts, cuts[index])))
         whole_lengths, cuts = whole_lengths[:len(time)], cuts[:len(time)]
     begin = np.append(origin, time[:-1])
     length = time - begin
     count = division.steps_needed(length, whole_lengths, cuts)
     steps = division.steps_per_interval(count)
     pieces = np.where((length > 0) | (not division.interval_per_step), -(-count // steps), 1)
-    event = np.repeat(np.arange(len(time)), pieces)
-    piece = np.arange(len(event)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    width = (length / pieces)[event]
-    last = piece == pieces[event] - 1
+    node = np.repeat(np.arange(len(time)), pieces)
+    piece = np.arange(len(node)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    width = (length / pieces)[node]
+    last = piece == pieces[node] - 1
     lengths, length_index = _group_lengths(width)
-    start = begin[event] + piece * width
-    end = np.where(last, time[event], np.append(start[1:], time[-1]))
-    intervals = intervals_between(start, end, width, np.where(last, observation[event], -1),
-                                  np.where(last, jump[event], -1), length_index, division.scale)
-    row_of_event = np.flatnonzero(last)
+    start = begin[node] + piece * width
+    end = np.where(last, time[node], np.append(start[1:], time[-1]))
+    observation_at_end, jump_at_end, event_at_end = (np.where(last, a[node], -1) for a in (observation, jump, event))
+    intervals = intervals_between(start, end, width, observation_at_end, jump_at_end, length_index, division.scale,
+                                  event_at_end)
+    row_of_node = np.flatnonzero(last)
     observed = np.empty(len(times), int)
-    observed[observation[observation >= 0]] = row_of_event[observation >= 0]
+    observed[observation[observation >= 0]] = row_of_node[observation >= 0]
     interval = observed
     if requested_times is not None:
-        interval = row_of_event[np.searchsorted(time, requested, side="right") - 1]
+        candidates = np.flatnonzero(rank < _EVENT_AFTER)
+        interval = row_of_node[candidates[np.searchsorted(time[candidates], requested, side="right") - 1]]
     replicated = bool(np.mean(width == 0) >= _REPLICATED)
     return TimeGrid(intervals, lengths, observed, interval, requested, steps, np.asarray(origin), replicated,
-                    since=(begin - origin)[event] + piece * width)
+                    since=(begin - origin)[node] + piece * width)
 
 
 def _forecast_interval(times: np.ndarray, length: float) -> float:

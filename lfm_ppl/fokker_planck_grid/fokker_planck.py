@@ -220,6 +220,9 @@ def _checked_ssm(model: Any) -> StateSpaceModel:
         raise ValueError("the parameters of the model must be known: the grid and its error are computed before "
                          "compilation. In compiled code use the log_likelihood of "
                          "lfm_ppl.fokker_planck_grid.fokker_planck, on a grid from choose_grid.")
+    if model.events:
+        raise ValueError("the Fokker-Planck grid does not support events. Use the particle filter, "
+                         "lfm.particle_filter, instead.")
     noise = model.process_noise if ssm.physical_dim else ssm.stack.dispersion()
     if noise is None or (not callable(noise) and not np.any(np.asarray(noise))):
         reason = "process_noise is zero" if ssm.physical_dim else f"the force {model.force_names[0]!r} has no noise"

@@ -106,11 +106,13 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         arrays = [jnp.asarray(leaf) for leaf in jax.tree.leaves((fields, distribution.rule))
                   if eqx.is_array_like(leaf)]
         self.values += [*arrays, ssm.initial(), ssm.stack.feedback(), ssm.stack.dispersion(),
-                        ssm.stack.jump_table(), jax.vmap(functions)(self.times)]
+                        ssm.stack.jump_table(), *jax.tree.leaves((model.events, ssm.state_maps())),
+                        jax.vmap(functions)(self.times)]
         self.settings += repr((
             site["name"], distribution.rule, distribution.steps, model.state_names, model.output_names,
             model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
-            model.deterministic_names, ssm.stack.jump_times))
+            model.deterministic_names, ssm.stack.jump_times,
+            [event.observation_first for event in model.events]))
         if isinstance(distribution, ConstrainedLikelihood):
             boxes = distribution.truncated_posterior().boxes
             self.values.append(boxes(*ssm.split(w), self.times[0]))

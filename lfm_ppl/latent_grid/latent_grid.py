@@ -294,6 +294,8 @@ def _check_model(ssm: StateSpaceModel) -> None:
                          "lfm.smooth.")
     if not model.force_names:
         raise ValueError("the model has no forces: there is nothing to put on a grid.")
+    if model.events:
+        raise ValueError("a grid of forces does not support events; use lfm.filter and lfm.smooth.")
     noise = model.process_noise
     concrete = None if callable(noise) or noise is None else checks.concrete(noise)
     if noise is not None and (concrete is None or concrete.any()):

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.forces.sde import Force
+from lfm_ppl.model.events import Event
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.inputs import InputRead, check_reads, has_inputs, input_reads
 from lfm_ppl.model.observation import GaussianObservation
@@ -53,6 +54,7 @@ class LatentForceModel(eqx.Module):
         deterministics: name -> ``(x, u, t) -> ()``, functions of state and forces, such as a rate ``softplus(u)``, a
             flow or a reproduction number. Results contain their trajectories and plot them, like
             ``numpyro.deterministic`` for parameters; they do not change the likelihood.
+        events: jumps of the state at given times, `Dose` and `Reset`; none by default.
 
     Raises:
         ValueError, TypeError: f returns a wrong shape; a function takes an entry out of range, or is not made of JAX
@@ -81,6 +83,7 @@ class LatentForceModel(eqx.Module):
     initial_state: Gaussian
     process_noise: Any
     initial_time: Any
+    events: tuple[Event, ...]
     force_names: tuple[str, ...] = eqx.field(static=True)
     deterministics: dict[str, Callable[..., jax.Array]]
     deterministic_names: tuple[str, ...] = eqx.field(static=True)
@@ -105,6 +108,7 @@ class LatentForceModel(eqx.Module):
         output_names: Sequence[str] | None = None,
         units: Mapping[str, str] | None = None,
         deterministics: Mapping[str, Callable[..., jax.Array]] | None = None,
+        events: Sequence[Event] = (),
     ):
         _check_types(dynamics, observation, initial_state)
         self.force_names, self.forces = _forces_by_name(forces)
@@ -122,6 +126,7 @@ class LatentForceModel(eqx.Module):
         self.state_names = _names("state_names", state_names, size, "x")
         if overlap := set(self.state_names) & set(self.force_names):
             raise ValueError(f"the name {sorted(overlap)[0]!r} is used for a state and for a force; rename one.")
+        self.events = _events(events, self.state_names)
         self.process_noise = process_noise if callable(process_noise) else _dispersion(process_noise, size)
         self.deterministics = _functions(deterministics, {*self.state_names, *self.force_names})
         self.deterministic_names = tuple(self.deterministics)
@@ -372,6 +377,15 @@ def _names(argument: str, names: Sequence[str] | None, size: int, prefix: str) -
     if len(set(names)) != size:
         raise ValueError(f"{argument} must not repeat, got {tuple(names)}.")
     return tuple(str(name) for name in names)
+
+
+def _events(events: Sequence[Event], state_names: Sequence[str]) -> tuple[Event, ...]:
+    events = (events,) if isinstance(events, Event) else tuple(events)
+    for event in events:
+        if not isinstance(event, Event):
+            raise TypeError(f"events must contain lfm.Dose and lfm.Reset, got {type(event).__name__}.")
+        event.check_target(state_names)
+    return events
 
 
 def _dispersion(value: Any, size: int) -> jax.Array | None:

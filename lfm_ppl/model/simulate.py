@@ -6,7 +6,7 @@
 3. Each step draws the forces at its end from their exact transition and process noise.
 4. The physical state follows by the classical Runge-Kutta method, with the forces linear in time over the step.
 5. Process noise enters with the dispersion at the start of the step (Ito), spread evenly over the step.
-6. At the end of a step that crosses a jump of a force, draw the jump.
+6. At the end of a step that crosses a jump of a force, draw the jump. Events end intervals, like breakpoints.
 7. Draw the observations at the rows from the noise or the observation family.
 
 Source: Kloeden and Platen (1992), Numerical Solution of Stochastic Differential Equations, section 9.1.
@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.model.events import StateMap, event_table
 from lfm_ppl.model.inputs import breakpoints_within
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import noisy_observation
@@ -119,17 +120,26 @@ class TimeNodes:
         rows: (T,), indices of the rows among the nodes.
         origin: (N,), index of each node in the concatenation of rows, subdivisions and breakpoints; a row if below T.
         steps: integration steps between neighbouring nodes.
+        state_map: maps (N, n) of the events at the nodes; None without events.
     """
 
     times: jax.Array
     rows: Any
     origin: Any
     steps: int
+    state_map: StateMap | None = None
 
 
-def _time_nodes(start: jax.Array, times: jax.Array, breakpoints: Any, steps: int) -> TimeNodes:
-    """Return the rows and the breakpoints of known inputs as nodes."""
-    count, breakpoint_count = times.shape[0], np.shape(breakpoints)[0]
+def _time_nodes(ssm: StateSpaceModel, start: jax.Array, times: jax.Array, breakpoints: Any, steps: int,
+                has_state: bool = False) -> TimeNodes:
+    """Return the rows, the breakpoints of known inputs and the events as nodes.
+
+    ``has_state``: whether the state at the start is given, so that events before an observation there have happened.
+    """
+    events = event_table(ssm.model.events)
+    event_times = jnp.asarray(events.times if events.traced_times is None else events.traced_times)
+    breakpoints = jnp.concatenate([jnp.asarray(breakpoints, float), event_times])
+    count, breakpoint_count = times.shape[0], breakpoints.shape[0]
     if not breakpoint_count:
         return TimeNodes(times, np.arange(count), np.arange(count), steps)
     # Every interval between nodes takes the same number of steps, also one that a breakpoint has divided. Subdividing
@@ -140,9 +150,17 @@ def _time_nodes(start: jax.Array, times: jax.Array, breakpoints: Any, steps: int
     interval_starts = jnp.concatenate([jnp.reshape(start, (1,)), times[:-1]])
     fractions = np.arange(1, pieces) / pieces
     subdivisions = (interval_starts[:, None] + (times - interval_starts)[:, None] * fractions).ravel()
-    nodes = jnp.concatenate([times, subdivisions, jnp.clip(jnp.asarray(breakpoints), start, times[-1])])
-    order = jnp.argsort(jax.lax.stop_gradient(nodes), stable=True)
-    return TimeNodes(nodes[order], jnp.argsort(order)[:count], order, steps_per_piece)
+    nodes = jnp.concatenate([times, subdivisions, jnp.clip(breakpoints, start, times[-1])])
+    is_first = np.logical_not(events.observation_first)
+    happens = jnp.where(is_first & has_state, event_times > start, event_times >= start) & (event_times <= times[-1])
+    other_count = nodes.shape[0] - event_times.shape[0]
+    rank = jnp.append(np.zeros(other_count, int), jnp.where(happens & is_first, -1, 1))
+    order = jnp.lexsort((rank, jax.lax.stop_gradient(nodes)))
+    maps = ssm.state_maps()
+    if maps is not None:
+        index = jnp.append(np.full(other_count, -1), jnp.where(happens, np.arange(len(is_first)), -1))[order]
+        maps = jax.tree.map(lambda a: a[index], maps)
+    return TimeNodes(nodes[order], jnp.argsort(order)[:count], order, steps_per_piece, maps)
 
 
 def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: jax.Array, steps: int,
@@ -154,16 +172,18 @@ def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: j
     initial_key, path_key, noise_key = jax.random.split(key, 3)
     mean, covariance = ssm.initial()
     first = mean + matmul(semidefinite_root(covariance), jax.random.normal(initial_key, (ssm.state_dim, 1)))[:, 0]
-    nodes = _time_nodes(start, times, breakpoints, steps)
+    nodes = _time_nodes(ssm, start, times, breakpoints, steps)
     starts = jnp.concatenate([jnp.reshape(start, (1,)), nodes.times[:-1]])
     integrate = _interval_integrator(ssm, nodes.steps)
 
     def integrate_to_node(state: jax.Array, interval: tuple) -> tuple[jax.Array, jax.Array]:
-        state = integrate(state, *interval)
+        *arguments, state_map = interval
+        state = integrate(state, *arguments)
+        state = state if state_map is None else state_map.apply(state)
         return state, state
 
     keys = jax.random.split(path_key, nodes.times.shape[0])
-    _, states = jax.lax.scan(integrate_to_node, first, (starts, nodes.times, keys))
+    _, states = jax.lax.scan(integrate_to_node, first, (starts, nodes.times, keys, nodes.state_map))
     states = states[nodes.rows]
     inputs = jax.vmap(ssm.inputs)(states, times)
     y = jax.vmap(lambda w, t, k, index: noisy_observation(ssm, w, t, k, index))(
@@ -189,20 +209,23 @@ def simulate_missing_states(ssm: StateSpaceModel, key: jax.Array, states: jax.Ar
     Returns:
         (K, n), the given states; every other state is simulated from its predecessor.
     """
-    nodes = _time_nodes(times[0], times, breakpoints, steps)
+    nodes = _time_nodes(ssm, times[0], times, breakpoints, steps, has_state=True)
     integrate = _interval_integrator(ssm, nodes.steps)
-    if np.shape(breakpoints)[0]:
+    if nodes.origin.shape[0] > times.shape[0]:
         is_row = nodes.origin < times.shape[0]
         index = jnp.minimum(nodes.origin, times.shape[0] - 1)
         states, is_given, times = states[index], is_given[index] & is_row, nodes.times
 
     def state_at_node(state: jax.Array, interval: tuple) -> tuple[jax.Array, jax.Array]:
-        start, end, interval_key, given_state, has_state = interval
+        start, end, interval_key, given_state, has_state, state_map = interval
         state = jax.lax.cond(has_state, lambda: given_state, lambda: integrate(state, start, end, interval_key))
+        state = state if state_map is None else state_map.apply(state)
         return state, state
 
     keys = jax.random.split(key, times.shape[0] - 1)
-    _, later_states = jax.lax.scan(state_at_node, states[0], (times[:-1], times[1:], keys, states[1:], is_given[1:]))
+    later_maps = jax.tree.map(lambda a: a[1:], nodes.state_map)
+    _, later_states = jax.lax.scan(state_at_node, states[0],
+                                   (times[:-1], times[1:], keys, states[1:], is_given[1:], later_maps))
     return jnp.concatenate([states[:1], later_states])[nodes.rows]
 
 

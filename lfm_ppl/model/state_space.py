@@ -24,6 +24,7 @@ import numpy as np
 
 from lfm_ppl.forces.sde import Stack, block_diagonal
 from lfm_ppl.linearisation.structure import InputStructure
+from lfm_ppl.model.events import StateMap, state_maps
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.structure import Pattern, pattern
 from lfm_ppl.utils import checks
@@ -124,6 +125,10 @@ class StateSpaceModel(eqx.Module):
         """Return R (D, D)."""
         x, u = self.split(w)
         return self.model.observation.covariance_at(x, u, t, row)
+
+    def state_maps(self) -> StateMap | None:
+        """Return the maps of the joint state at the events of the model, see `lfm_ppl.model.events.state_maps`."""
+        return state_maps(self.model.events, self.model.state_names, self.state_dim)
 
     @property
     def time_invariant(self) -> bool:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
-from lfm_ppl.filtering.intervals import Intervals, TimeGrid, with_observations
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid, with_observations, with_state_maps
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import check_noise, log_density
@@ -209,6 +209,7 @@ def filter_particles(ssm: StateSpaceModel, grid: TimeGrid, y: jax.Array, key: ja
     initial_key, rows_key = jax.random.split(key)
     count = settings.particles
     state = initial_particles(initial_key, *ssm.initial(), count)
+    grid = with_state_maps(ssm, grid)
     transition = ParticleTransition(ssm, settings.scheme, grid)
 
     def step(carry: tuple[jax.Array, jax.Array], inputs: tuple[Intervals, jax.Array, jax.Array]) -> tuple[tuple, Any]:

@@ -200,6 +200,8 @@ def _missing_density_reason(ssm: StateSpaceModel) -> str:
     """Return why the transition over a short time has no density; the empty string if it has one."""
     if ssm.stack.jump_times:
         return "a force jumps"
+    if ssm.model.events:
+        return "the model has events"
     if ssm.time_invariant:
         noise = exact(ssm, jnp.ones(()), 1).process_cov
         return "" if _is_regular(noise) else "not every state of this linear model has noise"
@@ -233,7 +235,7 @@ def draw_trajectories(ssm: StateSpaceModel, grid: TimeGrid, y: jax.Array, key: j
     last_index = _sample_indices(last_key, jnp.broadcast_to(steps.log_weights[-1], (draws, settings.particles)))
     rows = as_arrays(grid.intervals)
     particles = jax.tree_util.tree_map(lambda a: a[:-1], (steps.state, steps.log_weights, steps.ancestors))
-    intervals = Intervals(*(a[1:] for a in rows))
+    intervals: Intervals = jax.tree.map(lambda a: a[1:], rows)
     keys = jax.random.split(backward_key, rows.start.shape[0])[1:]
 
     def step_back(carry: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:

@@ -10,7 +10,7 @@ A step of length h from time t has four parts.
    "srk": Rössler's SRA1, strong order 1.5, additive noise;
    "milstein": strong order 1, commutative noise;
    "euler": strong order 1/2, any noise.
-4. After the last step of a row, let the forces jump if a jump time is at its end.
+4. After the last step of a row, let the forces jump if a jump time is at its end, and apply an event there.
 
 The scheme "exact" replaces parts 1 to 3 by one draw from the transition of a linear time-invariant model.
 
@@ -127,7 +127,7 @@ class ParticleTransition:
 
     def move(self, interval: Intervals, constants: StepConstants, move_key: jax.Array, jump_key: jax.Array,
              state: jax.Array) -> jax.Array:
-        """Move particles (n, N) over a row, and let the forces jump at its end."""
+        """Move particles (n, N) over a row, and apply the jump and the event at its end."""
         size = self.ssm.physical_dim
 
         def advance(state: jax.Array) -> jax.Array:
@@ -142,7 +142,9 @@ class ParticleTransition:
             return state
 
         state = jax.lax.cond(interval.length > 0, advance, identity, state) if self.grid.replicated else advance(state)
-        return state if self.jumps is None else jax.lax.cond(interval.jump >= 0, jump, identity, state)
+        if self.jumps is not None:
+            state = jax.lax.cond(interval.jump >= 0, jump, identity, state)
+        return state if interval.state_map is None else interval.state_map.apply(state.T).T
 
     def _advance(self, interval: Intervals, constants: StepConstants, key: jax.Array, state: jax.Array) -> jax.Array:
         """Integrate particles (n, N), one in each column, over a row of positive length."""

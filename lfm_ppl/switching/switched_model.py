@@ -87,6 +87,8 @@ def build_models(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ..
     if not isinstance(rule, SwitchingRule):
         raise TypeError(f"rule must be an lfm.SwitchingRule such as lfm.Thermostat(20.0), got {type(rule).__name__}.")
     ssms = tuple(state_space(build(value)) for value in rule.values)
+    if any(ssm.model.events for ssm in ssms):
+        raise ValueError("a switched model does not support events; leave out the events of build(value).")
     structures = [(ssm.model.state_names, ssm.model.force_names, ssm.model.output_names, ssm.state_dim,
                    ssm.stack.jump_times) for ssm in ssms]
     for value, structure in zip(rule.values, structures, strict=True):

@@ -201,7 +201,7 @@ def _joint_sweeps(problem: FilterProblem, terms: EntryTerms, settings: SiteSetti
                   updater: Updater) -> tuple[Sites, LinearizationPoints, FilterTrace]:
     """Return sites and points of linearisation, and the first forward scan."""
     grid = problem.grid
-    needs_ends_only = grid.steps == 1 and problem.shared.jumps is None
+    needs_ends_only = grid.steps == 1 and not problem.has_jumps
 
     # A sweep in which an entry has no cavity gives no new sites and points.
     def sweep(updater: Updater, points: LinearizationPoints | None) -> tuple[tuple, FilterTrace]:
