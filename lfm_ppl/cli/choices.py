@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl.cli.options import RULES
+from lfm_ppl.cli.options import RULES, Columns
+from lfm_ppl.io.data_set import DOSE
 from lfm_ppl.io.loading import ModelFile
 from lfm_ppl.utils import checks
 
@@ -63,24 +64,44 @@ def bounds(flag: str, texts: Sequence[str]) -> dict[str, float] | None:
     return bounds_by_name or None
 
 
-def inputs(columns_text: str | None, model: ModelFile) -> dict[str, tuple[str, str]]:
+def inputs(columns: Columns, model: ModelFile) -> dict[str, tuple[str, str]]:
     """Return the known inputs to read: name -> column of the file, interpolation.
 
-    Args:
-        columns_text: ``A,B:linear,C:zero``, columns in the order of the model's inputs; None: columns of these names.
-        model: the model file.
+    Columns of ``--inputs A,B:linear,C:zero`` are in the order of the model's inputs, those of ``--events A:STATE`` are
+    doses. By default the columns have the names of the model's inputs.
     """
+    functions = {name: way for name, way in model.inputs.items() if not way.startswith(DOSE)}
+    doses = {name: way for name, way in model.inputs.items() if way.startswith(DOSE)}
+    return _functions(columns.inputs, model, functions) | _doses(columns.events, doses)
+
+
+def _doses(text: str | None, doses: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    """Return the columns of doses; the doses of a model to the same state keep their name."""
+    if text is None:
+        return {name: (name, way) for name, way in doses.items()}
+    columns = {}
+    for part in text.split(","):
+        column, colon, state = (word.strip() for word in part.partition(":"))
+        if not (column and colon and state):
+            raise ValueError(f"--events takes COLUMN:STATE, the column of the doses and the state that receives them, "
+                             f"got {part!r}.")
+        name = next((name for name, way in doses.items() if way == DOSE + state), column)
+        columns[name] = (column, DOSE + state)
+    return columns
+
+
+def _functions(columns_text: str | None, model: ModelFile, ways: Mapping[str, str]) -> dict[str, tuple[str, str]]:
     if columns_text is None:
-        return {name: (name, way) for name, way in model.inputs.items()}
+        return {name: (name, way) for name, way in ways.items()}
     columns = [tuple(part.strip() for part in text.partition(":")[::2]) for text in columns_text.split(",")]
-    names = list(model.inputs) or [column for column, _ in columns]
+    names = list(ways) or [column for column, _ in columns]
     if len(names) != len(columns) or len(set(columns)) < len(columns):
         input_names = ", ".join(names)
         raise ValueError(
             f"{model.name} takes {checks.counted(len(names), 'known input')} ({input_names}); --inputs names "
             f"{checks.counted(len(columns), 'column')}, which must be as many, each of them once."
         )
-    return {name: (column, way or model.inputs.get(name, "previous"))
+    return {name: (column, way or ways.get(name, "previous"))
             for name, (column, way) in zip(names, columns, strict=True)}
 
 

@@ -14,7 +14,7 @@ from lfm_ppl.utils import calendar_time, checks
 
 def read_data(path: str, model: ModelFile, options: DataOptions) -> Data:
     """Return the observations in a file, under the model's names of its outputs and inputs."""
-    inputs = choices.inputs(options.columns.inputs, model)
+    inputs = choices.inputs(options.columns, model)
     observed = data.read_csv(path, output_columns(options.columns, model), options.columns.time_column,
                              dict(inputs.values()), options.time_unit, usual_unit=_time_unit(model))
     return _with_model_names(observed, model, inputs, path, options)
@@ -23,7 +23,7 @@ def read_data(path: str, model: ModelFile, options: DataOptions) -> Data:
 def read_series(model: ModelFile, options: DataOptions) -> dict[str, Data]:
     """Return the observations of each series of a file, under the model's names of its outputs and inputs."""
     assert options.data is not None and options.series is not None
-    inputs = choices.inputs(options.columns.inputs, model)
+    inputs = choices.inputs(options.columns, model)
     series = data.read_series(options.data, options.series, output_columns(options.columns, model),
                               options.columns.time_column, dict(inputs.values()), options.time_unit, _time_unit(model))
     return {name: _with_model_names(observed, model, inputs, options.data, options)

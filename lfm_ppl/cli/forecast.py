@@ -75,8 +75,8 @@ def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) 
     known_inputs = {}
     if held_out is not None:
         times = np.union1d(times, held_out.times)
-        known_inputs = {name: Input(*join_inputs(task.observed.inputs[name], later))
-                        for name, later in held_out.inputs.items()}
+        known_inputs = {name: table if table.dosed_state else Input(*table) for name, table in (
+            (name, join_inputs(task.observed.inputs[name], later)) for name, later in held_out.inputs.items())}
     keywords: dict[str, Any] = {"inputs": known_inputs, "model_kwargs": task.keywords}
     forecast = lfm_ppl.forecast(task.posterior, task.model, times, draws=options.draws, seed=options.seed,
                                 progress=not options.quiet, **keywords)
@@ -91,7 +91,7 @@ def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) 
 
 def join_inputs(earlier: InputTable, later: InputTable) -> InputTable:
     """Return a known input followed by later values."""
-    is_earlier = earlier.times < later.times[0]
+    is_earlier = earlier.times < later.times.min(initial=np.inf)
     return InputTable(np.append(earlier.times[is_earlier], later.times),
                       np.append(earlier.values[is_earlier], later.values), earlier.interpolation)
 
@@ -102,10 +102,12 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
     # Only the model file states that blank cells are zero.
     interpolations = {name: "zero" if task.file.inputs.get(name) == "zero" else table.interpolation
                       for name, table in observed.inputs.items()}
-    if options.columns.inputs is not None and not interpolations:
-        raise ValueError("--inputs names columns of known inputs, and the result has no known inputs; leave it out.")
+    for option in ("inputs", "events"):
+        if getattr(options.columns, option) is not None and not interpolations:
+            raise ValueError(f"--{option} names columns of known inputs, and the result has no known inputs; leave it "
+                             "out.")
     model = dataclasses.replace(task.file, outputs=observed.outputs, inputs=interpolations)
-    columns = choices.inputs(options.columns.inputs, model) if interpolations else {}
+    columns = choices.inputs(options.columns, model) if interpolations else {}
     read = data.read_csv(path, output_columns(options.columns, model), options.columns.time_column,
                          dict(columns.values()), None if observed.origin is None else observed.units.get("time"),
                          observed=not columns)

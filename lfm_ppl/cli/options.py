@@ -133,8 +133,11 @@ class Columns:
     """output columns (default: the outputs of the model)"""
     inputs: Annotated[Text, Parameter(metavar="A,B:linear,...")] | None = None
     """columns of known inputs, in the order of the model: constant until the next row, with :linear linear between
-    rows; blank cells are interpolated, with :zero they are zero, as for doses (default: columns with the names of the
-    model's inputs)"""
+    rows; blank cells are interpolated, with :zero they are zero (default: columns with the names of the model's
+    inputs)"""
+    events: Annotated[Text, Parameter(metavar="COLUMN:STATE,...")] | None = None
+    """columns of doses, and the states that receive them at the times of rows with a number (default: columns with the
+    names of the model's doses)"""
 
     def refuse_without(self, flag: str, file: str | None, **more: str | None) -> None:
         """Raise ValueError for a column, or another option about a data file, if there is no file."""

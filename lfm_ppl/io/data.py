@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lfm_ppl.io import table as tables
-from lfm_ppl.io.data_set import INTERPOLATIONS, Data, InputTable, fill_blanks
+from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, Data, InputTable, fill_blanks
 from lfm_ppl.io.missing_codes import warn_of_codes
 from lfm_ppl.io.table import Table, is_missing
 from lfm_ppl.utils import calendar_time, checks
@@ -29,8 +29,8 @@ def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column
             date.
         inputs: columns of known inputs; or a mapping column -> "previous" (a value holds until the next, the default)
             or "linear" (values are joined by lines), which interpolate over empty cells and warn of them; or "zero",
-            which is "previous" with empty cells read as zero, as for doses. A row at the time of another row that has
-            a value counts as filled.
+            which is "previous" with empty cells read as zero; or "dose:STATE", doses to a state in the rows with a
+            number (see `lfm_ppl.Dose`). A row at the time of another row that has a value counts as filled.
         time_unit: unit of times that are dates (ms, s, min, h, d, weeks, years). None: that of the time between rows.
         usual_unit: the default of ``time_unit``, the unit of a model.
         observed: whether a file without any value of the outputs is an error; known inputs of the future have none.
@@ -124,9 +124,21 @@ def write_csv(data: Data, path: str | Path) -> None:
     import pandas as pd
 
     unit = data.units.get("time", "")
-    inputs = [function(data.times) for function in data.known_inputs().values()]
+    functions = data.known_inputs()
+    inputs = [functions[name](data.times) if name in functions else _doses_in_rows(name, table, data.times)
+              for name, table in data.inputs.items()]
     header = [f"time_{unit}" if unit in calendar_time.SECONDS else "time", *data.outputs, *data.inputs]
     pd.DataFrame(np.column_stack([data.times, data.y, *inputs]), columns=header).to_csv(path, index=False)
+
+
+def _doses_in_rows(name: str, table: InputTable, times: np.ndarray) -> np.ndarray:
+    """Return doses (T,) in the first row of their times, NaN elsewhere."""
+    rows = np.searchsorted(times, table.times)
+    if not np.isin(table.times, times).all():
+        raise ValueError(f"the doses {name!r} need rows at their times; add rows of missing observations there.")
+    values = np.full(len(times), np.nan)
+    values[rows] = table.values
+    return values
 
 
 def _read(table: Table, outputs: Sequence[str] | None, time_column: str | None,
@@ -222,15 +234,17 @@ def _times(table: Table, name: str, unit: str | None, usual: str | None,
 
 def _input(table: Table, name: str, interpolation: str, times: np.ndarray) -> InputTable:
     """Return the column of a known input without its empty cells."""
-    checks.one_of(f"interpolation of {name}", interpolation, INTERPOLATIONS)
+    is_dose = interpolation.startswith(DOSE)
+    if not is_dose:
+        checks.one_of(f"interpolation of {name}", interpolation, INTERPOLATIONS)
     values = table.numbers(name)
     remedy = f"--inputs {name}:zero (inputs={{{name!r}: 'zero'}})"
-    if interpolation != "zero" and np.isnan(values[times == times[0]]).all():
+    if not is_dose and interpolation != "zero" and np.isnan(values[times == times[0]]).all():
         raise ValueError(f"{table.location(0, name)}: the known input has no value at the first time; fill the cell, "
                          f"or read empty cells as zero: {remedy}.")
     warn_of_codes(table, name, values)
     values = fill_blanks(f"{table.label}, column {name!r}", remedy, times, values, interpolation)
-    rows = np.flatnonzero(np.isfinite(values))
+    rows = np.flatnonzero(np.isfinite(values) & ~(is_dose & (values == 0)))
     unique_times, first, inverse = np.unique(times[rows], return_index=True, return_inverse=True)
     first_values = values[rows[first]]
     if (other_rows := rows[values[rows] != first_values[inverse]]).size:

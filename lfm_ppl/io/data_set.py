@@ -11,11 +11,15 @@ import numpy as np
 from lfm_ppl.utils import calendar_time, checks
 
 if TYPE_CHECKING:
+    from lfm_ppl.model.events import Dose
     from lfm_ppl.model.inputs import Input
 
 
 INTERPOLATIONS = ("previous", "linear", "zero")
 """How known inputs are read; "zero" is "previous" with blank cells read as zero."""
+
+DOSE = "dose:"
+"""Beginning of ``dose:STATE``, which reads a known input as doses to a state."""
 
 
 class InputTable(NamedTuple):
@@ -24,12 +28,17 @@ class InputTable(NamedTuple):
     Attributes:
         times: (K,), increasing.
         values: (K,).
-        interpolation: "previous" or "linear".
+        interpolation: "previous", "linear", or "dose:STATE" for doses.
     """
 
     times: np.ndarray
     values: np.ndarray
     interpolation: str = "previous"
+
+    @property
+    def dosed_state(self) -> str:
+        """Name of the state that receives the values as doses; empty for a function of time."""
+        return self.interpolation.removeprefix(DOSE) if self.interpolation.startswith(DOSE) else ""
 
 
 @dataclass(frozen=True)
@@ -46,7 +55,8 @@ class Data:
         note: what was done to the numbers, to be printed with the results.
         inputs: known inputs: name -> (times, values) or (times, values, "linear"), or an `lfm.Input`; kept as
             `InputTable`. `known_inputs` gives them as functions of time. Missing values are left out, or with "zero"
-            read as zero.
+            read as zero. (times, amounts, "dose:STATE") are doses to a state, which a model gets as `lfm.Dose` in its
+            argument ``events``.
         origin: the calendar time of t = 0 as ISO 8601 text, where the times were dates.
 
     Times, also of inputs, may be dates (``datetime64``, a DatetimeIndex, ...). They become numbers since the
@@ -101,6 +111,10 @@ class Data:
         """Return the known inputs as functions of time, for the ``inputs`` argument of a model."""
         return as_inputs(self.inputs)
 
+    def doses(self) -> list[Dose]:
+        """Return the doses among the known inputs, for the ``events`` argument of a model."""
+        return as_doses(self.inputs)
+
 
 def _input_table(name: str, value: Any, origin: str | None, unit: str) -> InputTable:
     """Return a known input, (times, values), (times, values, interpolation) or an `lfm.Input`, as a table."""
@@ -115,7 +129,7 @@ def _input_table(name: str, value: Any, origin: str | None, unit: str) -> InputT
     times = calendar_time.positions(label, times, origin, unit)
     times, values = (np.asarray(checks.unmask(part), float) for part in (times, values))
     if times.shape == values.shape and times.ndim == 1 and np.isnan(values).any():
-        if interpolation != "zero" and np.isnan(values).all():
+        if interpolation != "zero" and not interpolation.startswith(DOSE) and np.isnan(values).all():
             raise ValueError(f"every value of the known input {name!r} is missing; expected at least one number.")
         remedy = f"{name!r}: (times, values, 'zero')"
         values = fill_blanks(f"the known input {name!r}", remedy, times, values, interpolation)
@@ -128,12 +142,20 @@ def as_inputs(tables: Mapping[str, InputTable]) -> dict[str, Input]:
     # Here and not before: arrays made before float64 is enabled stay in float32.
     from lfm_ppl.model.inputs import Input
 
-    return {name: Input(*table, name=name) for name, table in tables.items()}
+    return {name: Input(*table, name=name) for name, table in tables.items() if not table.dosed_state}
+
+
+def as_doses(tables: Mapping[str, InputTable]) -> list[Dose]:
+    """Return the doses among known inputs."""
+    from lfm_ppl.model.events import Dose
+
+    return [Dose(table.times, table.values, table.dosed_state) for table in tables.values() if table.dosed_state]
 
 
 def model_keywords(tables: Mapping[str, InputTable], model_kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the keyword arguments of a model: those given, and ``inputs`` where there are known inputs."""
-    return {**({"inputs": as_inputs(tables)} if tables else {}), **(model_kwargs or {})}
+    """Return the keyword arguments of a model: those given, and ``inputs`` and ``events`` where the data have any."""
+    from_data = {"inputs": as_inputs(tables), "events": as_doses(tables)}
+    return {**{name: value for name, value in from_data.items() if value}, **(model_kwargs or {})}
 
 
 def at_origin(data: Data, origin: str, unit: str) -> Data:
@@ -152,8 +174,10 @@ def fill_blanks(label: str, remedy: str, times: np.ndarray, values: np.ndarray, 
     """Return the values (K,) of a known input, with zeros for NaN where the interpolation is "zero".
 
     Otherwise warn of NaN, over which the input is interpolated; ``remedy`` says how to read them as zero. NaN beside a
-    number of the same time counts as filled.
+    number of the same time counts as filled, and no dose is given where a dose is NaN.
     """
+    if interpolation.startswith(DOSE):
+        return values
     is_blank = np.isnan(values) & ~np.isin(times, times[np.isfinite(values)])
     if interpolation == "zero":
         return np.where(is_blank, 0.0, values)

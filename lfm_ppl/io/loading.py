@@ -10,14 +10,15 @@ and may define, each with a sensible default,
     prepare(data) -> lfm.Data                   converts the data of a file for ``model``
     anchors(data) -> dict                       parameters that are fixed for such data unless freed
     OUTPUTS      names of the outputs; None: the columns of the data file
-    INPUTS       known inputs: name -> "previous", "linear" or "zero", how they are read, see `lfm_ppl.read_csv`
+    INPUTS       known inputs: name -> how they are read, "previous", "linear", "zero" or "dose:STATE", see
+                 `lfm_ppl.read_csv`
     UNITS        name -> unit
     OPTIONS      option -> (default, tuple of choices or a type, help)
     PARAMETERS   name of a sample site -> help, with its unit
     TARGET_ACCEPT    target acceptance of NUTS, if the default makes its steps too long
 
-A ``model`` with an argument ``outputs``, ``units`` or ``inputs`` gets the names of the outputs, the units or the known
-inputs (name -> `lfm.Input`) of the data.
+A ``model`` with an argument ``outputs``, ``units``, ``inputs`` or ``events`` gets the names of the outputs, the units,
+the known inputs (name -> `lfm.Input`) or the doses (a list of `lfm.Dose`) of the data.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
 
-from lfm_ppl.io.data_set import INTERPOLATIONS, Data
+from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, Data
 from lfm_ppl.utils import checks
 
 _MODULE = "_lfm_ppl_model_"  # prefix of the names of the modules of model files
@@ -95,10 +96,13 @@ class ModelFile:
         """Return the keyword arguments of ``model`` for this data and these options."""
         keywords = {name: default for name, (default, _, _) in self.options.items()} | dict(options)
         parameters = inspect.signature(self.model).parameters
-        from_data = {"outputs": data.outputs, "units": dict(data.units), "inputs": data.known_inputs()}
-        if data.inputs and "inputs" not in parameters:
-            raise ValueError(f"{self.path}: the data have the known input {next(iter(data.inputs))!r}, and model(...) "
-                             "has no argument `inputs` to take it by.")
+        from_data = {"outputs": data.outputs, "units": dict(data.units), "inputs": data.known_inputs(),
+                     "events": data.doses()}
+        for name, table in data.inputs.items():
+            argument, kind = ("events", "doses") if table.dosed_state else ("inputs", "known input")
+            if argument not in parameters:
+                raise ValueError(f"{self.path}: the data have the {kind} {name!r}, and model(...) has no argument "
+                                 f"`{argument}` to take {'them' if table.dosed_state else 'it'} by.")
         for name in self.inputs:
             if name not in data.inputs:
                 raise ValueError(f"{self.name} needs the known input {name!r}, which the data do not have.")
@@ -192,8 +196,9 @@ _FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     **dict.fromkeys(("UNITS", "PARAMETERS", "OPTIONS"), ("a mapping", lambda value: isinstance(value, Mapping))),
     "OUTPUTS": ('a tuple of names, as in ("x",)', lambda value: (
         isinstance(value, (tuple, list)) and len(value) > 0 and all(isinstance(name, str) for name in value))),
-    "INPUTS": (f"a mapping of names to one of {', '.join(INTERPOLATIONS)}", lambda value: (
-        isinstance(value, Mapping) and all(interpolation in INTERPOLATIONS for interpolation in value.values()))),
+    "INPUTS": (f"a mapping of names to one of {', '.join(INTERPOLATIONS)} or {DOSE}STATE", lambda value: (
+        isinstance(value, Mapping) and all(way in INTERPOLATIONS or str(way).startswith(DOSE)
+                                           for way in value.values()))),
     "TARGET_ACCEPT": ("between 0 and 1", lambda value: isinstance(value, int | float) and 0 < value < 1)}
 """Definition of a model file -> its form, and whether a value has it."""
 
@@ -217,7 +222,7 @@ def _checked(path: Path, module: ModuleType) -> ModelFile:
                              f"default among the choices, got {option!r}.")
     parameters = inspect.signature(functions["model"]).parameters
     _check_signature(path, definitions, "model", None, None, **dict.fromkeys(options),
-                     **{name: None for name in ("outputs", "units", "inputs") if name in parameters})
+                     **{name: None for name in ("outputs", "units", "inputs", "events") if name in parameters})
     description = (module.__doc__ or "").strip()
     return ModelFile(
         _name(path), description.partition("\n")[0], description, path, MappingProxyType(definitions),

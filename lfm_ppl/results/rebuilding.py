@@ -12,6 +12,7 @@ import xarray as xr
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.likelihood_site import LikelihoodSite
+from lfm_ppl.io.data_set import InputTable, as_doses, model_keywords
 from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.results.likelihoods import LikelihoodProblem
 
@@ -39,8 +40,15 @@ def observations(result: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def keywords(result: Any, later: Mapping[str, Any] | None, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the keyword arguments of a result's model with known inputs that reach further; see `lfm_ppl.forecast`."""
-    arguments, stored = inputs.keywords(result, overrides), inputs.inputs_of(result)
+    stored = inputs.inputs_of(result)
+    doses = {name: InputTable(*value) for name, value in (later or {}).items()
+             if name in stored and stored[name].dosed_state}
+    arguments = model_keywords(stored, overrides)
+    if doses:
+        arguments["events"] = as_doses(stored | doses)
     for name, value in (later or {}).items():
+        if name in doses:
+            continue
         arguments |= {"inputs": {**arguments["inputs"], name: value}} if name in stored else {name: value}
     return arguments
 

@@ -46,7 +46,8 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
         numpyro_model: the model that was fitted. A result holds draws and data, but no code.
         times: (K,) times of the forecast, non-decreasing, from the initial time on; dates if the data have dates.
         inputs: known inputs (`lfm_ppl.Input`) that reach as far as ``times``, and are the same as before at the data:
-            inputs by name, or keyword arguments of the model, that replace the ones of the result.
+            inputs by name, or keyword arguments of the model, that replace the ones of the result. Doses are
+            (times, amounts, "dose:STATE"), with all those before.
         model_kwargs: keyword arguments of the model, as in the fit.
         draws: number of posterior draws, spread over the chains, each with a path of its own.
         seed: of the paths and the noise.
@@ -120,8 +121,9 @@ def _forecast(result: Any, numpyro_model: Callable, times: np.ndarray, inputs: M
     observed = groups["observed_data"]
     names = {name: observed[name].values.tolist() for name in ("output", "series") if name in observed.coords}
     groups[GROUP] = predictions(bound, split, labels, times, names)
-    if continued := {name: InputTable(np.asarray(value.times), np.asarray(value.values), value.interpolation)
-                     for name, value in (inputs or {}).items() if isinstance(value, Input)}:
+    if continued := {name: InputTable(*value) if isinstance(value, tuple) else InputTable(
+            np.asarray(value.times), np.asarray(value.values), value.interpolation)
+                     for name, value in (inputs or {}).items() if isinstance(value, Input | tuple)}:
         groups[known_inputs.FORECAST] = known_inputs.to_dataset(continued)
     return arviz_data.build(groups, attrs)
 

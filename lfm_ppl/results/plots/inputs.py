@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lfm_ppl.io.data_set import InputTable
 from lfm_ppl.results.inputs import FORECAST, input_unit, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import forecasts, style
 from lfm_ppl.results.plots.trajectories import MAX_PANELS
@@ -55,13 +57,10 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
     _, end = forecasts.forecast_span(result)
     for axes, name in zip(panels, names, strict=True):
         table = tables[name]
-        draw_style = "steps-post" if table.interpolation == "previous" else "default"
-        marker = "o" if len(table.times) <= _MANY else ""
-        axes.plot(table.times, table.values, drawstyle=draw_style, marker=marker, ms=2.2, color=style.PURPLE, mew=0,
-                  label="known input")
-        if table.times[-1] < end:
-            axes.plot([table.times[-1], end], np.repeat(table.values[-1], 2), color=style.PURPLE, ls="--",
-                      label="held beyond its table")
+        if table.dosed_state:
+            _draw_doses(axes, table)
+        else:
+            _draw_function(axes, table, end)
         forecasts.mark_last_observation(axes, result)
         style.label_values(axes, name, input_unit(result, name))
     if window := forecasts.forecast_window(result):
@@ -72,3 +71,22 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
     if note:
         style.note_below(figure, note)
     return figure
+
+
+def _draw_function(axes: Axes, table: InputTable, end: float) -> None:
+    """Draw an input as the model reads it, held to the end of a forecast."""
+    draw_style = "steps-post" if table.interpolation == "previous" else "default"
+    marker = "o" if len(table.times) <= _MANY else ""
+    axes.plot(table.times, table.values, drawstyle=draw_style, marker=marker, ms=2.2, color=style.PURPLE, mew=0,
+              label="known input")
+    if table.times[-1] < end:
+        axes.plot([table.times[-1], end], np.repeat(table.values[-1], 2), color=style.PURPLE, ls="--",
+                  label="held beyond its table")
+
+
+def _draw_doses(axes: Axes, table: InputTable) -> None:
+    """Draw doses as stems from zero."""
+    axes.vlines(table.times, 0.0, table.values, color=style.PURPLE, lw=1.2, label="dose")
+    axes.plot(table.times, table.values, "o", ms=2.2, color=style.PURPLE, mew=0)
+    low, high = table.values.min(initial=0.0), table.values.max(initial=0.0)
+    axes.set_ylim(1.1 * low, 1.1 * high if high > low else 1.0)

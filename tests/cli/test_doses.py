@@ -1,0 +1,68 @@
+"""Doses in a column of a data file, from the file to the forecast."""
+
+from __future__ import annotations
+
+import pytest
+
+import lfm_ppl as lfm
+from lfm_ppl.io.data import write_csv
+from lfm_ppl.io.loading import load
+from lfm_ppl.results import arviz_data
+
+MODEL = '''"""A drug in the blood."""
+import jax.numpy as jnp
+import numpyro
+import numpyro.distributions as dist
+import lfm_ppl as lfm
+
+OUTPUTS = ("blood",)
+
+
+def model(times, y=None, events=()):
+    ke = numpyro.sample("ke", dist.LogNormal(-1.0, 0.5))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: jnp.stack([-1.3 * x[0], 1.3 * x[0] - ke * x[1]]), {},
+        lfm.GaussianObservation(lambda x, u, t: x[1:], jnp.array([0.01])),
+        lfm.Gaussian(jnp.zeros(2), jnp.zeros((2, 2))), state_names=("gut", "blood"), output_names=OUTPUTS,
+        events=events)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+'''
+
+ROWS = "time,AMT,blood\n0,4,\n1,,1.8\n2,,2.4\n4,0,1.9\n8,4,0.9\n10,,2.6\n"
+
+
+@pytest.fixture
+def files(tmp_path):
+    (tmp_path / "drug.py").write_text(MODEL)
+    (tmp_path / "drug.csv").write_text(ROWS)
+    (tmp_path / "later.csv").write_text("time,AMT,blood\n12,4,\n14,,\n")
+    return tmp_path
+
+
+def test_doses_are_the_rows_with_an_amount(files):
+    data = lfm.read_csv(files / "drug.csv", ["blood"], inputs={"AMT": "dose:gut"})
+    (dose,) = data.doses()
+    assert dose.times.tolist() == [0.0, 8.0] and dose.values.tolist() == [4.0, 4.0] and dose.state == "gut"
+    assert data.known_inputs() == {}
+    write_csv(data, files / "copy.csv")
+    copy = lfm.read_csv(files / "copy.csv", ["blood"], inputs={"AMT": "dose:gut"})
+    assert copy.inputs["AMT"].times.tolist() == [0.0, 8.0]
+    keywords = load(str(files / "drug.py")).keywords(data, {})
+    assert [event.state for event in keywords["events"]] == ["gut"]
+
+
+def test_doses_of_a_file_reach_the_fit_and_the_forecast(files, run):
+    status, _, errors = run(f"fit {files}/drug.py --data {files}/drug.csv --events AMT:gut --out out --sampler map "
+                            "--samples 50")
+    assert status == 0, errors
+    # The rows after the data repeat the doses of the last interval, so that the forecast must rise after the dose.
+    status, _, errors = run(f"forecast out --held-out {files}/later.csv --events AMT:gut --out ahead --draws 20")
+    assert status == 0, errors
+    stored = arviz_data.group(arviz_data.load("ahead"), "predictions")["y"].mean(("chain", "draw", "output"))
+    assert stored.sel(time=14.0) > 2.0 > stored.sel(time=12.0)
+    assert "forecast-inputs.png" in {path.name for path in (files / "ahead").iterdir()}
+
+
+def test_a_column_without_a_state_is_refused(files, run):
+    status, _, errors = run(f"fit {files}/drug.py --data {files}/drug.csv --events AMT")
+    assert status == 2 and "--events takes COLUMN:STATE" in errors
