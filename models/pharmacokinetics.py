@@ -8,10 +8,10 @@ between the blood (the central compartment) and, with two compartments, a tissue
     tissue' = exchange / volume blood - exchange / tissue_volume tissue,
     y_k = blood(t_k) / volume + e_k,    e_k ~ N(0, noise_sd^2).
 
-The unexplained input u is a Gaussian process with a Matern-3/2 covariance: absorption that is not of the first order, or
-a recirculation of the drug. Clearance and volumes are relative to the share of the dose that is absorbed. An absorption
-that is slower than the elimination explains the same data as a fast one with another volume ("flip-flop"); the priors
-prefer the fast one. The model is linear, so that filter, smoother and likelihood are exact.
+The unexplained input u is a Gaussian process with a Matern-3/2 covariance: absorption that is not of the first order,
+or a recirculation of the drug. Clearance and volumes are relative to the share of the dose that is absorbed. An
+absorption that is slower than the elimination explains the same data as a fast one with another volume ("flip-flop");
+the priors prefer the fast one. The model is linear, so that filter, smoother and likelihood are exact.
 
 A data file has a column with the doses, in rows of its own or beside a concentration: ``--events COLUMN:gut`` where the
 column is not called ``dose``.

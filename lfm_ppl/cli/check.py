@@ -26,6 +26,7 @@ from lfm_ppl.results import arviz_data, checkpoint, files, likelihoods, rebuildi
 from lfm_ppl.results.accuracy import check_accuracy
 from lfm_ppl.results.correction import correct_posterior
 from lfm_ppl.results.report import GROUP, AccuracyReport
+from lfm_ppl.results.series import times_of
 from lfm_ppl.results.verdict import CORRECT
 from lfm_ppl.utils import atomic_files
 from lfm_ppl.utils.interruption import INTERRUPTED, interruptible
@@ -159,7 +160,7 @@ def _exact_chains(task: StoredFit, options: CheckOptions, folder: Path) -> Any:
         warmup = max(warmup, _WARMUP)
     trajectory_times = None
     if arviz_data.has_group(task.posterior, "trajectories"):
-        trajectory_times = arviz_data.group(task.posterior, "trajectories")["at"].values
+        trajectory_times = times_of(arviz_data.group(task.posterior, "trajectories"), "at").values
     kind = ", delayed acceptance" if options.delayed else ""
     print(f"correct  particle-marginal RAM{kind}, {chains} chains of {warmup} warm-up and {samples} kept draws",
           flush=True)

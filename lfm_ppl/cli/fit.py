@@ -20,13 +20,13 @@ import numpy as np
 
 import lfm_ppl
 from lfm_ppl.cli import choices, fit_many, page, results, session
-from lfm_ppl.cli.data_file import read_data
+from lfm_ppl.cli.data_file import read_data, read_series
 from lfm_ppl.cli.fit_arguments import approximated_model, result_attributes, sampling_arguments
 from lfm_ppl.cli.options import DataOptions, FitArguments
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.io import loading
-from lfm_ppl.io.data_set import Data
+from lfm_ppl.io.data_set import Data, stack_series
 from lfm_ppl.io.truth import read_truth
 from lfm_ppl.results import arviz_data, checkpoint, files, html_report, tables
 from lfm_ppl.utils import calendar_time
@@ -36,10 +36,15 @@ from lfm_ppl.utils.progress import duration
 
 def run(name: str, options: FitArguments, line: Sequence[str]) -> int:
     """Fit, print the summary, and write the results; the posterior is on disk before any figure."""
-    if options.data.each or options.data.series is not None:
+    is_panel = loading.is_panel(name)
+    if options.data.each or (options.data.series is not None and not is_panel):
         return fit_many.run(name, options, line)
     if options.processes.jobs is not None or options.processes.scheduler is not None:
-        raise ValueError("--jobs and --scheduler are for many data sets; give them with --each or --series.")
+        raise ValueError("--jobs and --scheduler are for many data sets; give them with --each or --series" + (
+            ", and leave them out with a model of all series together." if is_panel else "."))
+    if is_panel and options.data.data is not None and options.data.series is None:
+        raise ValueError(f"{name} is a model of several series (lfm.panel); name the column of --data that identifies "
+                         "the series of each row with --series.")
     output = options.output
     session.start(options.inference.chains, not output.no_cache)
     model = loading.load(name)
@@ -96,7 +101,8 @@ def observed_data(options: DataOptions, model: loading.ModelFile, model_options:
     options.columns.refuse_without("--data", options.data, time_unit=options.time_unit, truth=options.truth)
     if options.data is None:
         return model.simulate(**model_options)
-    observed = read_data(options.data, model, options)
+    observed = (read_data(options.data, model, options) if options.series is None
+                else stack_series(read_series(model, options)))
     if options.truth is not None:
         observed = dataclasses.replace(observed, truth=read_truth(options.truth))
     return model.prepare(observed)
@@ -107,7 +113,9 @@ def _print_data(options: FitArguments, model: loading.ModelFile, observed: Data,
     counts = dict(zip(observed.outputs, np.isnan(observed.y).reshape(-1, len(observed.outputs)).sum(axis=0),
                       strict=True))
     rows, missing = observed.y[..., 0].size, int(sum(counts.values()))
-    text = f"{len(observed.times)} rows of {', '.join(observed.outputs)}"
+    text = f"{observed.times.shape[-1]} rows of {', '.join(observed.outputs)}"
+    if observed.series:
+        text = f"{len(observed.series)} series of up to {text}"
     if missing:
         text += f"; {missing} values missing"
     if missing and len(counts) > 1:

@@ -70,4 +70,5 @@ def result_attributes(options: FitArguments, line: Sequence[str], model: loading
         "meanings": json.dumps(dict(model.parameters)),
         "command_line": page.command_line(line),
         **({"note": observed.note} if observed.note else {}),
+        **({"series_column": options.data.series} if observed.series and options.data.series else {}),
     }

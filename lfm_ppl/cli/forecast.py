@@ -30,6 +30,7 @@ from lfm_ppl.model.inputs import Input
 from lfm_ppl.results import arviz_data, files, inputs, plots, tables
 from lfm_ppl.results.plots.trajectories import trajectory_names
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, MEAN, held_out_data, summary
+from lfm_ppl.results.series import select_series, series_dimension, series_labels
 from lfm_ppl.utils import atomic_files, calendar_time
 
 TABLE = "forecast.csv"
@@ -99,6 +100,8 @@ def join_inputs(earlier: InputTable, later: InputTable) -> InputTable:
 def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data:
     """Return the data of a file, on the clock of the fitted data and under the names of the result."""
     observed = task.observed
+    if observed.series:
+        raise ValueError("--held-out is for results of one series; score a panel in Python, lfm.score(forecast, y).")
     # Only the model file states that blank cells are zero.
     interpolations = {name: "zero" if task.file.inputs.get(name) == "zero" else table.interpolation
                       for name, table in observed.inputs.items()}
@@ -143,7 +146,7 @@ def _write(forecast: Any, scores: pd.DataFrame | None, task: StoredFit, path: Pa
                 updated = arviz_data.add_group(updated, name, arviz_data.group(forecast, name))
     target = folder / files.POSTERIOR if options.out else path
     print(f"wrote    {arviz_data.save(updated, target, options.overwrite or not options.out)} (group {GROUP})")
-    table, origin = summary(group), task.observed.origin
+    table, origin = _table(forecast), task.observed.origin
     if origin is not None:  # dates as in the data
         unit = task.observed.units["time"]
         table.index = pd.Index([calendar_time.clock(float(time), origin, unit, "T", 3) for time in table.index],
@@ -156,6 +159,19 @@ def _write(forecast: Any, scores: pd.DataFrame | None, task: StoredFit, path: Pa
     more = {} if scores is None else {"Scores on the held-out data": scores}
     paths = [folder / name for name, status in statuses.items() if status == 0]
     return max(*statuses.values(), page.update(updated, folder, paths, more))
+
+
+def _table(forecast: Any) -> pd.DataFrame:
+    """Return the summary of the predictions, with a column of labels where there are several series."""
+    dimension = series_dimension(forecast)
+    if dimension is None:
+        return summary(arviz_data.group(forecast, GROUP))
+    tables_of_series = []
+    for label in series_labels(forecast):
+        table = summary(arviz_data.group(select_series(forecast, label), GROUP))
+        table.insert(0, dimension, label)
+        tables_of_series.append(table)
+    return pd.concat(tables_of_series)
 
 
 def _figures(forecast: Any) -> Iterator[tuple[str, Callable]]:

@@ -61,7 +61,10 @@ def _bind(model: loading.ModelFile) -> Any:
     else:
         times, outputs = np.arange(3.0), model.outputs or ("y",)
         inputs = {name: InputTable(times, np.ones(3), way) for name, way in model.inputs.items()}
-        data = Data(times, np.zeros((3, len(outputs))), outputs, units=model.units, inputs=inputs)
+        labels = ("1", "2") if loading.is_panel(str(model.path)) else ()
+        shape = (2, 3) if labels else (3,)
+        data = Data(np.broadcast_to(times, shape), np.zeros((*shape, len(outputs))), outputs, units=model.units,
+                    inputs=inputs, series=labels)
     return bind(model.model, data.times, data.y, **model.keywords(data, {}))
 
 

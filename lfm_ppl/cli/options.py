@@ -157,7 +157,7 @@ class DataOptions:
     each: bool = False
     """fit each file of the pattern --data separately"""
     series: Name | None = None
-    """fit each series separately: the rows with the same value in this column"""
+    """fit each series separately: the rows with the same value in this column; all together if the model is a panel"""
     columns: Annotated[Columns, Parameter(name="*")] = Columns()
     time_unit: Annotated[Text, Parameter(metavar="UNIT")] | None = None
     """unit of times that are dates: ms, s, min, h, d, weeks, years (default: the model's, else by the gaps)"""

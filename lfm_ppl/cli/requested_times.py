@@ -7,7 +7,7 @@ import numpy as np
 from lfm_ppl.cli.options import Times
 from lfm_ppl.io.data_set import Data
 from lfm_ppl.utils import calendar_time
-from lfm_ppl.workflows.fit_results import subdivide
+from lfm_ppl.workflows.fit_results import pad_grids, subdivide
 
 _TRAJECTORY_TIMES = 241
 """Number of times of the trajectories between the first and the last one: enough for a smooth line."""
@@ -20,8 +20,9 @@ def trajectory_times(observed: Data, requests: Times) -> np.ndarray | None:
     """Return the times of the trajectories; None without --until and --at, for the library's grid."""
     if requests == Times():
         return None
-    times = np.union1d(observed.times, requested_times(observed, requests))
-    return subdivide(times, _TRAJECTORY_TIMES)
+    requested = requested_times(observed, requests)
+    grids = [subdivide(np.union1d(times, requested), _TRAJECTORY_TIMES) for times in np.atleast_2d(observed.times)]
+    return pad_grids(grids) if observed.series else grids[0]
 
 
 def requested_times(observed: Data, requests: Times) -> np.ndarray:
@@ -35,7 +36,7 @@ def requested_times(observed: Data, requests: Times) -> np.ndarray:
         raise ValueError(f"--at takes finite times, separated by commas, got {requests.at}.")
     if requests.until is None:
         return np.unique(times)
-    last, end = observed.times[-1], _parse_time("--until", requests.until, observed)
+    last, end = observed.times.max(), _parse_time("--until", requests.until, observed)
     if not (np.isfinite(end) and end > last):
         last_time = f"{last:g}" if observed.origin is None else calendar_time.clock(
             last, observed.origin, observed.units["time"], "T")

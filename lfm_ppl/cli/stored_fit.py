@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lfm_ppl.cli import choices
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
@@ -33,6 +35,7 @@ def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit
     from lfm_ppl.results import arviz_data, rebuilding
     from lfm_ppl.results.inputs import ORIGIN, inputs_of
     from lfm_ppl.results.scalars import unit_of
+    from lfm_ppl.results.series import TIMES, series_dimension, series_labels, times_of
 
     attrs = arviz_data.attributes(posterior)
     model_path = model_file or attrs.get("model_file")
@@ -49,19 +52,18 @@ def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit
         times, y = rebuilding.observations(posterior)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    if y.ndim != 2 or times.ndim != 1:
-        raise ValueError(f"{path} is of a panel of series; use lfm.check_accuracy or lfm.forecast in Python.")
     group = arviz_data.group(posterior, "observed_data")
     outputs = tuple(str(name) for name in group["output"].values)
     if model.outputs is not None and model.outputs != outputs:
         raise ValueError(f"{path} is of the outputs {', '.join(outputs)}; {model.path} has "
                          f"{', '.join(model.outputs)}. Give the file that it was made with.")
-    (variable,) = (group[name] for name in group.data_vars)
+    (variable,) = (group[name] for name in group.data_vars if name != TIMES)
     units = {name: unit for name in outputs if (unit := unit_of(variable, name))}
-    if clock := unit_of(group["time"]):
+    if clock := unit_of(times_of(group)):
         units["time"] = clock
-    observed = Data(times, y, outputs, units={**model.units, **units}, inputs=inputs_of(posterior),
-                    origin=attrs.get(ORIGIN))
+    labels = [] if series_dimension(posterior) is None else series_labels(posterior)
+    observed = Data(np.broadcast_to(times, y.shape[:-1]), y, outputs, units={**model.units, **units},
+                    inputs=inputs_of(posterior), origin=attrs.get(ORIGIN), series=tuple(map(str, labels)))
     options = _json_attribute(attrs, "options", path)
     unknown = sorted(set(options) - set(model.options))
     if unknown:

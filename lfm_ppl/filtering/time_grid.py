@@ -59,7 +59,8 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         steps: integration steps between two consecutive times.
         max_step: longest step; a longer interval gets more steps, in intervals of ``steps`` each. None: see
             `longest_step`.
-        requested_times: (K,), in any order; None: the observation times.
+        requested_times: (K,), in any order; None: the observation times. Traced ones are for traced times; there are
+            then ``steps`` integration steps between two consecutive ones of all times.
         initial_time: overrides that of the model (when the scan starts from a filter's state).
         interval_per_step: make every integration step an interval, for a particle smoother.
         tolerance: of the error of a step, see `TimeGrid`.
@@ -121,15 +122,18 @@ def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_
     breakpoints = jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
     division = replace(division, traced_breakpoints=len(breakpoints) + len(events.times), scale=_time_scale(reads))
     jumps, steps = ssm.stack.jump_times, division.steps
+    is_concrete_request = requested_times is not None and not checks.traced(requested_times)
     if concrete_times is not None and jumps and division.max_step is None and requested_times is None:
         grid = _grid_from_traced_origin(concrete_times, initial_time, jumps, steps, division.interval_per_step)
     else:
-        if division.max_step is not None or requested_times is not None or jumps:
+        if division.max_step is not None or is_concrete_request or jumps:
             raise ValueError("max_step, requested times and forces with jumps need times (the first two also an "
                              "initial_time or `start`) that are known before compilation; pass NumPy arrays rather "
                              "than traced values, and do not convert them with jnp inside the model.")
         part = division.steps_per_interval(np.full(np.shape(times)[0], steps))
         grid = _grid_from_traced_times(times, -(-steps // part), part, initial_time)
+        if requested_times is not None:
+            grid = _grid_from_traced_request(times, requested_times, part, initial_time)
     intervals = grid.intervals
     inner = inset(intervals.start, intervals.end, intervals.length, division.scale)
     return _insert_traced_times(grid._replace(intervals=intervals._replace(inset=inner)), breakpoints, events,
@@ -273,6 +277,18 @@ def _grid_from_traced_times(times: Any, pieces: int, steps: int, initial_time: A
     observation[last] = np.arange(times.shape[0])
     intervals = intervals_between(start, end, width, observation, np.full(observation.shape, -1))
     return TimeGrid(intervals, None, last, last, times, steps, origin[0], since=since)
+
+
+def _grid_from_traced_request(times: Any, requested_times: Any, steps: int, initial_time: Any) -> TimeGrid:
+    """Return an interval of ``steps`` steps between any two consecutive ones of all times, (T,) and (K,), sorted."""
+    count = np.shape(times)[0]
+    nodes = jnp.concatenate([jnp.asarray(times, float), jnp.asarray(requested_times, float)])
+    order = jnp.argsort(nodes, stable=True)
+    position = jnp.argsort(order)
+    grid = _grid_from_traced_times(nodes[order], 1, steps, times[0] if initial_time is None else initial_time)
+    observation = jnp.concatenate([jnp.arange(count), jnp.full(np.shape(requested_times), -1)])[order]
+    return grid._replace(intervals=grid.intervals._replace(observation=observation), observed=position[:count],
+                         requested=position[count:], requested_times=nodes[count:])
 
 
 def _grid_from_traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float, ...], steps: int,

@@ -92,7 +92,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         key: a JAX random key.
         bound: the model and its data.
         draws: site name -> (S, ...).
-        at: (K,) times of the trajectories, or None for the observation times.
+        at: (K,) times of the trajectories, or (B, K) for each series of a panel; None: the observation times.
         particles: settings of the particle smoother; None: the Gaussian smoother.
         particle_steps: integration steps of the particles between two observations; None: the model's.
         report: as in `map_draws`.
@@ -112,27 +112,31 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         of that distribution; and ``log_likelihood`` (S, ...).
     """
     at = None if at is None else np.asarray(at, float)
-    if at is not None and bound.times.ndim == 1 and np.array_equal(at, bound.times):
+    if at is not None and np.array_equal(at, bound.times):
         at = None
     example = bound.site.example
     is_forecast = None
     if particles is None and not isinstance(example, ConstrainedLikelihood) and example.ssm.drift_structure.nonlinear:
         is_forecast = _has_forecast(bound, at)
     plan = _plan(bound, at, particles is not None or is_forecast is not None,
-                 _first_simulated_time(bound) if is_forecast else -np.inf)
+                 _first_simulated_times(bound) if is_forecast else np.full(bound.times.shape[:-1], -np.inf))
 
-    def draw_series(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
+    def draw_series(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array,
+                    path_times: Any = plan.times) -> dict[str, jax.Array]:
         ssm = distribution.ssm
         path_key, noise_key = jax.random.split(key)
         results: dict[str, jax.Array] = {}
         if isinstance(distribution, ConstrainedLikelihood):
             smoothed = None
-            w, when = distribution.feasible_path(path_key, y, plan.times)
+            w, when = distribution.feasible_path(path_key, y, path_times)
         elif particles is None:
             # Where the path is simulated the smoother stays at the last row of the data, at no cost.
-            reached = plan.times if plan.times is None or not is_forecast else np.minimum(plan.times, bound.times.max())
-            smoothed = distribution.smooth(y, reached)
-            when = smoothed.times if plan.times is None else jnp.asarray(plan.times, float)
+            reached = path_times
+            if is_forecast and path_times is not None:
+                minimum = jnp.minimum if plan.is_of_series else np.minimum
+                reached = minimum(path_times, distribution.times[-1] if plan.is_of_series else bound.times.max())
+            smoothed = distribution.smooth(y, reached, plan.smoother_steps)
+            when = smoothed.times if path_times is None else jnp.asarray(path_times, float)
             states = smoothed.sample_joint(path_key, 1)[0]
             is_smoothed = jnp.ones((len(when), 1), bool)
             if is_forecast:
@@ -146,8 +150,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             results |= {"log_likelihood": smoothed.log_likelihood.sum()}
         else:
             smoothed = None
-            w, when = _particle_path(distribution, y, plan.times, path_key, particles,
-                                     particle_steps or distribution.steps)
+            w, when = _particle_path(distribution, y, path_times, path_key, particles,
+                                     particle_steps or plan.smoother_steps or distribution.steps)
         requested, data = plan.requested, plan.data
         results["deterministic"] = jax.vmap(ssm.deterministics)(w[requested], when[requested])
         if isinstance(ssm.model.observation, ObservationFamily):
@@ -184,7 +188,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         distribution = bound.likelihood(values, y)
         y = bound.data(y)
         keys = jax.random.split(key, y.shape[0]) if isinstance(distribution, Panel) else key
-        return map_series(distribution, draw_series, y, keys)
+        return map_series(distribution, draw_series, y, keys, *([plan.times] if plan.is_of_series else []))
 
     rows = plan.rows
     width = 1 if particles is None else particles.particles
@@ -212,31 +216,64 @@ class _Plan:
     """Times of the paths.
 
     Attributes:
-        times: (L,), requested times, times between them, and times of the data; None: the times of the data.
+        times: (L,), requested times, times between them, and times of the data, or (B, L) where series have their own;
+            None: the times of the data.
         requested: (K,), rows of the requested times.
         data: (T,), rows of the data.
         steps: steps of the simulation in each row.
+        smoother_steps: steps of the smoother between two times of a series with its own times; None: the model's.
     """
 
     times: np.ndarray | None
     requested: np.ndarray
     data: np.ndarray
     steps: int
+    smoother_steps: int | None = None
+
+    @property
+    def is_of_series(self) -> bool:
+        """Whether each series has times of its own."""
+        return self.times is not None and self.times.ndim == 2
 
     @property
     def rows(self) -> int:
         """Number of times."""
-        return len(self.data) if self.times is None else len(self.times)
+        return len(self.data) if self.times is None else self.times.shape[-1]
 
 
-def _plan(bound: BoundModel, requested_times: np.ndarray | None, simulated: bool, since: float) -> _Plan:
+def _plan(bound: BoundModel, requested_times: np.ndarray | None, simulated: bool, since: np.ndarray) -> _Plan:
     """Return the rows, of which rows after ``since`` are simulated, if any are.
 
     After the data, rows are at most as far apart as the data usually are where a simulation or the known inputs of a
     linear model are integrated.
+
+    Args:
+        bound: the model and its data.
+        requested_times: (K,), or (B, K) for each series; None: the times of the data.
+        simulated: whether paths are simulated.
+        since: time, or times (B,) where series have their own.
     """
+    if requested_times is None or bound.times.ndim == 1:
+        return _plan_of(bound, bound.times, requested_times, simulated, float(np.min(since)))
+    requested_times = np.broadcast_to(requested_times, (len(bound.times), requested_times.shape[-1]))
+    plans = [_plan_of(bound, times, requested, simulated, float(start))
+             for times, requested, start in zip(bound.times, requested_times, since, strict=True)]
+    length = max(plan.rows for plan in plans)
+    count, data = requested_times.shape[1], plans[0].data.size
+    # The first requested time pads the times between requested ones, of which series have different numbers.
+    rows = [np.insert(times, count, np.repeat(times[0], length - len(times)))
+            for times in (plan.times for plan in plans) if times is not None]
     example = bound.site.example
-    times = bound.times
+    smoother_steps = [_steps_per_interval(example.ssm, times, row, example.steps)
+                      for times, row in zip(bound.times, rows, strict=True)]
+    return _Plan(np.array(rows), plans[0].requested, np.arange(length - data, length),
+                 max(plan.steps for plan in plans), max(smoother_steps))
+
+
+def _plan_of(bound: BoundModel, times: np.ndarray, requested_times: np.ndarray | None, simulated: bool,
+             since: float) -> _Plan:
+    """Return the rows of series with these times; arguments as in `_plan`."""
+    example = bound.site.example
     gaps = np.diff(times, axis=-1)
     base = example.steps
     if example.max_step is not None:
@@ -260,15 +297,15 @@ def _plan(bound: BoundModel, requested_times: np.ndarray | None, simulated: bool
 def _has_forecast(bound: BoundModel, requested_times: np.ndarray | None) -> bool:
     """Return whether a time of the trajectories lies after the last observation of a series."""
     is_observed = np.isfinite(np.asarray(bound.y)).any(axis=-1)
-    if requested_times is not None and requested_times.max() > bound.times.max():
+    if requested_times is not None and np.any(requested_times > bound.times[..., -1:]):
         return True
     return not bool(np.all(is_observed[..., -1]))
 
 
-def _first_simulated_time(bound: BoundModel) -> float:
-    """Return the time of the last observation of the series that ends first."""
+def _first_simulated_times(bound: BoundModel) -> np.ndarray:
+    """Return the time of the last observation of each series."""
     is_observed = np.isfinite(np.asarray(bound.y)).any(axis=-1)
-    return float(np.where(is_observed, bound.times, -np.inf).max(axis=-1).min())
+    return np.where(is_observed, bound.times, -np.inf).max(axis=-1)
 
 
 def _last_observed(y: jax.Array, when: jax.Array, plan: _Plan) -> jax.Array:
@@ -279,7 +316,7 @@ def _last_observed(y: jax.Array, when: jax.Array, plan: _Plan) -> jax.Array:
 def _simulate_forecast(distribution: SeriesLikelihood, states: jax.Array, when: jax.Array, is_smoothed: jax.Array,
                        plan: _Plan, key: jax.Array) -> jax.Array:
     """Return the joint states (L, n), simulated after the last smoothed one; ``is_smoothed`` is (L,)."""
-    order = np.arange(plan.rows) if plan.times is None else np.argsort(plan.times, kind="stable")
+    order = jnp.arange(plan.rows) if plan.times is None else jnp.argsort(when, stable=True)
     # Breakpoints before the first time or after the last one change nothing.
     breakpoints = input_breakpoints(distribution.model, None, None)
     path = simulate_missing_states(distribution.ssm, key, states[order], when[order], is_smoothed[order], plan.steps,

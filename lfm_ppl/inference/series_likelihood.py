@@ -150,9 +150,13 @@ class SeriesLikelihood(dist.Distribution):
         y = self.checked(y)
         return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
 
-    def smooth(self, y: Any, at: Any = None) -> SmootherResult:
-        """Smooth with this distribution's settings; see `lfm_ppl.smooth`. Constraints are ignored."""
-        grid = build_time_grid(self.ssm, self.times, self.steps, self.max_step, at, tolerance=self.tolerance)
+    def smooth(self, y: Any, at: Any = None, steps: int | None = None) -> SmootherResult:
+        """Smooth with this distribution's settings, or with other ``steps``; see `lfm_ppl.smooth`.
+
+        Constraints are ignored.
+        """
+        steps = self.steps if steps is None else steps
+        grid = build_time_grid(self.ssm, self.times, steps, self.max_step, at, tolerance=self.tolerance)
         y = self.checked(y)
         return smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
 

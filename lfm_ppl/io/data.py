@@ -11,6 +11,7 @@ import numpy as np
 
 from lfm_ppl.io import table as tables
 from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, Data, InputTable, fill_blanks
+from lfm_ppl.io.data_set import stack_series as stack_series
 from lfm_ppl.io.missing_codes import warn_of_codes
 from lfm_ppl.io.table import Table, is_missing
 from lfm_ppl.utils import calendar_time, checks

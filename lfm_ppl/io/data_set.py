@@ -46,8 +46,8 @@ class Data:
     """Observations y_k at times t_k of named outputs, and the truth where it is known.
 
     Attributes:
-        times: t_k, shape (T,), non-decreasing; equal times are replicates.
-        y: observations, shape (T, D); NaN is a missing value.
+        times: t_k, shape (T,), non-decreasing; equal times are replicates. (B, T) for the series of a panel.
+        y: observations, shape (T, D), or (B, T, D); NaN is a missing value.
         outputs: the names of the D outputs.
         units: name -> unit, for ``time``, outputs, states, forces and known inputs; incomplete is fine.
         truth: for simulated data, a mapping with any of ``times`` (K,), ``forces`` (name -> (K,)),
@@ -58,6 +58,7 @@ class Data:
             read as zero. (times, amounts, "dose:STATE") are doses to a state, which a model gets as `lfm.Dose` in its
             argument ``events``.
         origin: the calendar time of t = 0 as ISO 8601 text, where the times were dates.
+        series: labels of the B series of a panel; empty for one series.
 
     Times, also of inputs, may be dates (``datetime64``, a DatetimeIndex, ...). They become numbers since the
     origin, by default the midnight before the first of them, in the unit of ``units["time"]``, by default that of the
@@ -80,6 +81,7 @@ class Data:
     note: str = ""
     inputs: Mapping[str, Any] = field(default_factory=dict)
     origin: str | None = None
+    series: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Convert to arrays and check that the shapes fit together."""
@@ -98,14 +100,17 @@ class Data:
         for name, value in {"times": times, "y": y, "outputs": tuple(self.outputs), "units": units, "inputs": inputs,
                             "origin": origin}.items():
             object.__setattr__(self, name, value)
-        if times.ndim != 1 or y.shape != (times.size, len(self.outputs)):
-            raise ValueError(f"y must have shape (times, outputs) = ({times.size}, {len(self.outputs)}), got {y.shape} "
-                             f"for times of shape {times.shape} and outputs {self.outputs}.")
+        lead = (len(self.series),) if self.series else ()
+        if times.shape[:-1] != lead or times.ndim == 0 or y.shape != (*times.shape, len(self.outputs)):
+            expected = (*lead, times.shape[-1] if times.ndim else 1, len(self.outputs))
+            raise ValueError(f"y must have shape ({'series, ' if lead else ''}times, outputs) = {expected}, got "
+                             f"{y.shape} for times of shape {times.shape} and outputs {self.outputs}.")
         checks.finite("times", times)
-        if (times[1:] < times[:-1]).any():
-            index = int(np.argmax(times[1:] < times[:-1])) + 1
-            raise ValueError(f"times must not go back, got {times[index]:g} after {times[index - 1]:g} at index "
-                             f"{index}. Sort the observations by time.")
+        for row in np.atleast_2d(times):
+            if (row[1:] < row[:-1]).any():
+                index = int(np.argmax(row[1:] < row[:-1])) + 1
+                raise ValueError(f"times must not go back, got {row[index]:g} after {row[index - 1]:g} at index "
+                                 f"{index}. Sort the observations by time.")
 
     def known_inputs(self) -> dict[str, Input]:
         """Return the known inputs as functions of time, for the ``inputs`` argument of a model."""
@@ -168,6 +173,40 @@ def at_origin(data: Data, origin: str, unit: str) -> Data:
     inputs = {name: table._replace(times=table.times * ratio + shift) for name, table in data.inputs.items()}
     return replace(data, times=data.times * ratio + shift, truth=truth, origin=origin, inputs=inputs,
                    units={**data.units, "time": unit})
+
+
+def stack_series(series: Mapping[str, Data]) -> Data:
+    """Return the series of a panel as one data set, for a model with `lfm_ppl.panel`.
+
+    Shorter series are padded with rows that are all missing, at their last time.
+
+    Args:
+        series: label -> observations, as of `lfm_ppl.data.read_series`.
+
+    Raises:
+        ValueError: a series has known inputs, or other outputs than the first one; not all times are dates.
+
+    Example:
+        >>> short, long = Data([0.0], [[1.0]], ("x",)), Data([0.0, 2.0], [[1.5], [0.5]], ("x",))
+        >>> panel = stack_series({"Ann": short, "Bo": long})
+        >>> panel.series, panel.times.tolist(), panel.y[0].ravel().tolist()
+        (('Ann', 'Bo'), [[0.0, 0.0], [0.0, 2.0]], [1.0, nan])
+    """
+    label, first = next(iter(series.items()))
+    for name, data in series.items():
+        if data.inputs:
+            raise ValueError(f"series {name!r} has the known input {next(iter(data.inputs))!r}, which the series of a "
+                             "file cannot have in a panel; give it to lfm.fit by model_kwargs=.")
+        if (data.outputs, data.origin is None) != (first.outputs, first.origin is None):
+            raise ValueError(f"series {name!r} must have the outputs {', '.join(first.outputs)} and dates or numbers as"
+                             f" times, as series {label!r}.")
+    if first.origin is not None:
+        origin = min(str(data.origin) for data in series.values())
+        series = {name: at_origin(data, origin, first.units["time"]) for name, data in series.items()}
+    rows = max(len(data.times) for data in series.values())
+    times = [np.pad(data.times, (0, rows - len(data.times)), "edge") for data in series.values()]
+    y = [np.pad(data.y, ((0, rows - len(data.y)), (0, 0)), constant_values=np.nan) for data in series.values()]
+    return replace(next(iter(series.values())), times=np.array(times), y=np.array(y), series=tuple(series))
 
 
 def fill_blanks(label: str, remedy: str, times: np.ndarray, values: np.ndarray, interpolation: str) -> np.ndarray:

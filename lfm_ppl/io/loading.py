@@ -17,12 +17,16 @@ and may define, each with a sensible default,
     PARAMETERS   name of a sample site -> help, with its unit
     TARGET_ACCEPT    target acceptance of NUTS, if the default makes its steps too long
 
+A file that calls `lfm.panel` is fitted to several series together: ``model`` gets times (B, T) and y (B, T, D), where
+shorter series are padded.
+
 A ``model`` with an argument ``outputs``, ``units``, ``inputs`` or ``events`` gets the names of the outputs, the units,
 the known inputs (name -> `lfm.Input`) or the doses (a list of `lfm.Dose`) of the data.
 """
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import inspect
 import os
@@ -171,6 +175,17 @@ def load(name: str) -> ModelFile:
             raise ValueError(f"unknown model {name!r}. Did you mean the file {name}.py?")
         raise ValueError(f"{checks.unknown('model', name, shipped)} A model of your own has a path, as ./{name}.py.")
     return _checked(shipped[shipped_name], _execute(shipped[shipped_name]))
+
+
+def is_panel(name: str) -> bool:
+    """Return whether a model file calls `lfm_ppl.panel`, so that series are fitted together; the file is not run."""
+    path = available().get(name.replace("_", "-"), Path(name).expanduser())
+    try:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+    except (OSError, SyntaxError):  # `load` reports them
+        return False
+    functions = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    return any(getattr(function, "attr", getattr(function, "id", "")) == "panel" for function in functions)
 
 
 def _execute(path: Path) -> ModuleType:

@@ -32,7 +32,7 @@ from lfm_ppl.results.approximation import more_iterations
 from lfm_ppl.results.likelihoods import LikelihoodProblem, Reference, ReferenceSettings
 from lfm_ppl.results.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.results.scalars import choose, scalar_draws
-from lfm_ppl.results.verdict import NOISE_SD, Findings, judge
+from lfm_ppl.results.verdict import NOISE_SD, NOISE_SHARE, Findings, judge
 from lfm_ppl.utils import checks
 
 REFERENCES = ("auto", "grid", "particles")
@@ -41,7 +41,7 @@ _LARGEST_VARIANCE = 100.0
 """Of the noise of a log ratio, where all replicates but one find the data impossible."""
 
 _MOST_WORK = 2e10
-"""Limit on particle steps of a check: some ten minutes on two cores for a small model."""
+"""Limit on particle steps times states of a check: some ten minutes on two cores."""
 
 
 def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None, *, reference: str = "auto",
@@ -65,7 +65,8 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         reference: "grid" (Fokker-Planck equation; one state), "particles", or "auto": the grid for one state with
             noise, else particles, and none where the filter is exact, for linear models with Gaussian noise.
         draws: number of posterior draws to compare at, spread evenly over the chains.
-        particles: in each run of the particle filter; by default as many as keep the noise low.
+        particles: in each run of the particle filter; by default as many as keep the noise low. Where that takes
+            minutes, as for panels, fewer at first, and more only if their noise leaves the verdict open.
         replicates: runs of the particle filter for each draw, at least 2.
         steps: integration steps of the reference between two observations; by default as in the fit.
         model_kwargs: keyword arguments of the model, as in the fit.
@@ -161,7 +162,7 @@ def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: n
         iterated: (C, S), with more iterations of posterior linearisation; None where there are none to add.
     """
     posterior = arviz_data.group(result, "posterior")
-    averaged = importance.average(reference.estimates.reshape(*filtered.shape, -1))
+    averaged = _summed(reference.estimates.reshape(*filtered.shape, *reference.estimates.shape[1:]))
     ratio = averaged.log_mean - filtered
     efficiency = _relative_efficiency(filtered)
     weights = importance.smooth(ratio, efficiency)
@@ -227,6 +228,8 @@ def _refit(attrs: Mapping[str, Any]) -> str:
     words = ["lfm-ppl", "fit", str(attrs["model_file"])]
     if attrs.get("data", "simulated") != "simulated":
         words += ["--data", str(attrs["data"])]
+    if attrs.get("series_column"):
+        words += ["--series", str(attrs["series_column"])]
     if attrs.get("sampler", "nuts") != "nuts":
         words += ["--sampler", str(attrs["sampler"])]
     rule = json.loads(attrs.get("settings") or "{}").get("rule")
@@ -281,8 +284,23 @@ def _noisy(ssm: StateSpaceModel) -> bool:
 
 def _reference(problem: LikelihoodProblem, filtered: np.ndarray, settings: ReferenceSettings) -> Reference:
     if settings.kind == "none":
-        return Reference(filtered.reshape(-1, 1), f"{EXACT}: for this linear model the Gaussian filter is exact")
+        return Reference(filtered.reshape(-1, 1, 1), f"{EXACT}: for this linear model the Gaussian filter is exact")
     if settings.kind == "grid":
         return likelihoods.on_grid(problem, settings)
+
+    def is_settled(estimates: np.ndarray) -> bool:
+        averaged = _summed(estimates)
+        ratio = averaged.log_mean.reshape(filtered.shape) - filtered
+        if not np.isfinite(ratio).any():
+            return False
+        is_noisy = _share(noise(averaged), ratio) > NOISE_SHARE
+        return importance.smooth(ratio, _relative_efficiency(filtered)).reliable or not is_noisy
+
     return likelihoods.by_particles(
-        problem, settings, lambda estimates: noise(importance.average(estimates)), NOISE_SD, _MOST_WORK)
+        problem, settings, lambda estimates: noise(_summed(estimates)), NOISE_SD, _MOST_WORK, is_settled)
+
+
+def _summed(estimates: np.ndarray) -> importance.Averaged:
+    """Return the averages over replicates of log likelihoods (..., B, R), summed over the series."""
+    averaged = importance.average(estimates)
+    return importance.Averaged(averaged.log_mean.sum(axis=-1), averaged.variance.sum(axis=-1))

@@ -14,6 +14,7 @@ from lfm_ppl.inference.posterior import evenly_spaced, trajectories
 from lfm_ppl.results import arviz_data, importance, rebuilding
 from lfm_ppl.results.layout import with_summaries
 from lfm_ppl.results.report import AccuracyReport
+from lfm_ppl.results.series import TIMES, times_of
 from lfm_ppl.utils import checks
 
 _KEPT = ("observed_data", "truth")
@@ -84,7 +85,7 @@ def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwarg
     """Draw trajectories at some of the picked draws, in the layout of ``result``."""
     templates = {name: arviz_data.group(result, name) for name in _DRAWN if arviz_data.has_group(result, name)}
     template = templates["trajectories"]
-    path_times = template["at"].values if "at" in template.coords else None
+    path_times = times_of(template, "at").values if {"at", TIMES} & set(template.coords) else None
     draw_index, rows = evenly_spaced(picked.shape[0], picked.shape[1], count)
     problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs).select(picked.ravel()[rows])
     paths = {label: values.reshape(picked.shape[0], len(draw_index), *values.shape[1:]) for label, values in

@@ -15,6 +15,7 @@ from lfm_ppl.inference.map_draws import map_draws, map_series
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.results.series import times_of
 
 _PATH, _VALUES, _TIMES = "path of the inputs", "held-out values", "times of the path"
 """Under these names they go with the draws; no site has such a name."""
@@ -36,7 +37,7 @@ def log_densities(bound: BoundModel, draws: Mapping[str, Any], predicted: xr.Dat
     if not isinstance(observation, ObservationFamily):
         raise ValueError("the observation of the model is Gaussian, whose densities the predictions hold already; "
                          "leave out numpyro_model.")
-    times = np.asarray(predicted["time"].values, float)
+    times = np.asarray(times_of(predicted).values, float)
     w = _inputs(predicted, y.shape[:-1])
     count = len(w)
 
@@ -57,12 +58,12 @@ def log_densities(bound: BoundModel, draws: Mapping[str, Any], predicted: xr.Dat
         w, y, times = values.pop(_PATH), values.pop(_VALUES), values.pop(_TIMES)
         distribution = bound.likelihood(values, data)
         if isinstance(distribution, Panel):
-            times = jnp.broadcast_to(times, (y.shape[0], *times.shape))
+            times = jnp.broadcast_to(times, (y.shape[0], times.shape[-1]))
         return map_series(distribution, series_log_prob, w, y, times)
 
     log_densities = map_draws(bound, ("log densities", y.shape), per_draw,
                       {**draws, _PATH: w, _VALUES: np.broadcast_to(y, (count, *y.shape)),
-                       _TIMES: np.broadcast_to(times, (count, len(times)))}, jax.random.key(0))
+                       _TIMES: np.broadcast_to(times, (count, *times.shape))}, jax.random.key(0))
     return np.where(np.isfinite(y), log_densities, np.nan)
 
 

@@ -31,6 +31,7 @@ from lfm_ppl.results.inputs import ORIGIN, input_unit, inputs_of, time_origin, t
 from lfm_ppl.results.plots import saving, style
 from lfm_ppl.results.residuals import misfit
 from lfm_ppl.results.scalars import unit_of
+from lfm_ppl.results.series import TIMES, select_series, series_dimension, series_labels, times_of
 from lfm_ppl.utils import calendar_time
 from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
 
@@ -213,13 +214,14 @@ def _paragraphs(text: str) -> list[tuple[bool, str]]:
 
 def _data(result: Any, attrs: Mapping[str, Any]) -> dict[str, Any]:
     dataset = arviz_data.group(result, "observed_data")
-    name = next(str(label) for label in dataset.data_vars if label != "times")
+    name = next(str(label) for label in dataset.data_vars if label != TIMES)
     variable, origin = dataset[name], _origin(result)
-    times = np.asarray((dataset["times"] if "times" in dataset else dataset["time"]).values, float)
+    times = np.asarray(times_of(dataset).values, float)
     names = [str(output) for output in variable["output"].values] if "output" in variable.coords else [name]
     columns = np.asarray(variable.values, float).reshape(-1, len(names)).T
     inputs = inputs_of(result)
-    facts = {"source": attrs.get("data"), "series": variable.sizes.get("series"), "rows": variable.sizes["time"],
+    facts = {"source": attrs.get("data"), "series": variable.sizes.get(series_dimension(result)),
+             "rows": variable.sizes["time"],
              "missing": f"{int(variable.isnull().sum())} of {variable.size} values", "times": _span(times, result),
              "time 0": calendar_time.clock(0.0, origin, time_unit(result)) if origin else None,
              "note": attrs.get("note")}
@@ -269,10 +271,12 @@ def _forecast(result: Any, more: Mapping[str, pd.DataFrame]) -> dict[str, Any] |
     """Return tables of the predictions, after the data where any of them are."""
     if not arviz_data.has_group(result, predictions.GROUP):
         return {"tables": more, "more": more, "label": "", "count": 0, "most_series": 0, "total": 0} if more else None
-    dataset = arviz_data.group(result, predictions.GROUP)
-    times, unit, origin = np.asarray(dataset["time"].values, float), time_unit(result), _origin(result)
-    later = np.flatnonzero(times > dataset.attrs.get("last_observation", np.inf))
-    index = later if later.size else np.arange(times.size)
+    labels = [] if series_dimension(result) is None else series_labels(result)
+    views = {view.attrs["selected"]: view for view in (select_series(result, label) for label in labels[:_MOST_SERIES])}
+    groups = {title: arviz_data.group(view, predictions.GROUP) for title, view in (views or {"": result}).items()}
+    dataset, unit, origin = next(iter(groups.values())), time_unit(result), _origin(result)
+    later = np.flatnonzero(dataset["time"].values > dataset.attrs.get("last_observation", np.inf))
+    index = later if later.size else np.arange(dataset.sizes["time"])
     thinned = index[np.unique(np.linspace(0, index.size - 1, _MOST_TIMES).round().astype(int))]
 
     def table(series: xr.Dataset) -> pd.DataFrame:
@@ -280,12 +284,9 @@ def _forecast(result: Any, more: Mapping[str, pd.DataFrame]) -> dict[str, Any] |
         return frame.set_axis([calendar_time.clock(float(time), origin, unit) if origin else f"{time:.10g}"
                                for time in frame.index])
 
-    count = dataset.sizes.get("series", 0)
-    names = dataset["series"].values if "series" in dataset.coords else range(count)
-    series = {f"Series {name}": table(dataset.isel(series=number)) for number, name in enumerate(names[:_MOST_SERIES])}
-    return {"tables": (series or {"": table(dataset)}) | dict(more), "more": more,
+    return {"tables": {title: table(series) for title, series in groups.items()} | dict(more), "more": more,
             "label": f"time ({unit})" if unit and not origin else "time", "is_later": later.size > 0,
-            "shown": thinned.size, "total": index.size, "count": count, "most_series": _MOST_SERIES}
+            "shown": thinned.size, "total": index.size, "count": len(labels), "most_series": _MOST_SERIES}
 
 
 def _plain(value: Any) -> str:

@@ -66,7 +66,7 @@ def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | Non
     if data is not None and data.inputs:
         groups[GROUP] = to_dataset(data.inputs, data.units)
     for dataset in groups.values():
-        for name in {"time", "at", "at_truth"} & set(dataset.coords):
+        for name in {"time", "at", "at_truth", "times"} & set(dataset.coords):
             if unit and not dataset[name].attrs.get("units"):
                 dataset[name].attrs["units"] = unit
     return {} if origin is None else {ORIGIN: origin}
@@ -74,7 +74,7 @@ def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | Non
 
 def time_unit(result: Any) -> str:
     """Return the unit of time, empty where the result does not know it."""
-    for name, coordinate in (("observed_data", "time"), ("trajectories", "at")):
+    for name, coordinate in (("observed_data", "time"), ("observed_data", "times"), ("trajectories", "at")):
         if arviz_data.has_group(result, name) and coordinate in (dataset := arviz_data.group(result, name)).coords:
             if unit := unit_of(dataset[coordinate]):
                 return unit

@@ -23,13 +23,15 @@ from lfm_ppl.io.truth import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
 from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, PERIODS, mixture_quantiles, predictions
 from lfm_ppl.results.scalars import DERIVED, units_attribute
+from lfm_ppl.results.series import SERIES, TIMES, plate_dimension
 from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:
     from lfm_ppl.inference.bound_model import BoundModel
     from lfm_ppl.model.latent_force_model import LatentForceModel
 
-SERIES, OUTPUT = "series", "output"
+OUTPUT = "output"
+
 
 @dataclass(frozen=True)
 class Labels:
@@ -39,11 +41,13 @@ class Labels:
         dims: site -> a name, or None where there is none, for each axis of its value.
         coords: dimension -> labels.
         derived: names of the deterministic sites.
+        series: dimension of the series of a panel, the name of its plate; None for one series.
     """
 
     dims: Mapping[str, tuple[str | None, ...]]
     coords: Mapping[str, list]
     derived: frozenset[str] = frozenset()
+    series: str | None = None
 
     @classmethod
     def of(cls, bound: BoundModel, dims: Mapping[str, Sequence[str]] | None = None,
@@ -51,21 +55,23 @@ class Labels:
         """Return the names that a model and its user give.
 
         A site's own dimensions come from ``dims``, else from ``event_dims`` of its ``infer`` and from the plates that
-        it stands in. The plate of a panel is called "series", as in the other groups.
+        it stands in. The plate of a panel is the dimension of the series in all groups, with the labels of the data or
+        the numbers from zero.
 
         Args:
             bound: the model.
             dims: site -> names of the axes of its value.
             coords: dimension -> labels.
-            y: the data as they were given, whose column names are kept.
+            y: the data as they were given, whose column names, or labels of the first dimension, are kept.
 
         Raises:
             ValueError: a site that the model has not; a number of names or labels that does not fit.
         """
         trace = bound.trace()
         site = bound.site
+        series = plate_dimension(bound)
         plates = [frame.name for frame in trace[site.name].get("cond_indep_stack", ())]
-        renamed = {plates[0]: SERIES} if np.ndim(bound.y) == 3 and len(plates) == 1 else {}
+        renamed = {plates[0]: series} if series is not None and len(plates) == 1 else {}
         dimensions: dict[str, tuple[str | None, ...]] = {}
         derived = set()
         for name, site_trace in trace.items():
@@ -82,13 +88,18 @@ class Labels:
                                  f"{np.shape(trace[name]['value'])}, and {len(names)} names: {', '.join(names)}.")
             dimensions[name] = tuple(str(text) for text in names)
         sizes = {OUTPUT: len(site.example.ssm.model.output_names)}
-        sizes |= {SERIES: np.shape(bound.y)[0]} if np.ndim(bound.y) == 3 else {}
+        sizes |= {} if series is None else {series: np.shape(bound.y)[0]}
         for name, axes in dimensions.items():
             for text, size in zip(axes, np.shape(trace[name]["value"]), strict=True):
                 if text is not None and sizes.setdefault(text, size) != size:
                     raise ValueError(f"the dimension {text!r} has {sizes[text]} entries elsewhere and {size} in "
                                      f"{name!r}; give them different names.")
+        if series is not None:
+            renamed = {SERIES: series, **renamed}
         labels = {renamed.get(text, text): list(values) for text, values in (coords or {}).items()}
+        if series is not None and series not in labels:
+            has_labels = getattr(y, "dims", None) and y.dims[0] in y.coords  # an array of xarray
+            labels[series] = y[y.dims[0]].values.tolist() if has_labels else list(range(sizes[series]))
         if OUTPUT not in labels and hasattr(y, "columns"):
             labels[OUTPUT] = [str(column) for column in y.columns]
         for text, values in labels.items():
@@ -97,7 +108,7 @@ class Labels:
             if len(values) != sizes[text] or len(set(values)) < len(values):
                 raise ValueError(f"coords: the dimension {text!r} needs {sizes[text]} labels, each of them once; got "
                                  f"{len(values)}: {', '.join(map(str, values))}.")
-        return cls(dimensions, labels, frozenset(derived))
+        return cls(dimensions, labels, frozenset(derived), series)
 
 
 def _axes(site: Mapping[str, Any], renamed: Mapping[str, str]) -> tuple[str | None, ...]:
@@ -150,11 +161,10 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
     chains, samples = next(iter(draws.values())).shape[:2]
     model = site.example.ssm.model
     units = model.units
-    panel = (SERIES,) if y.ndim == 3 else ()
-    per_series = times.ndim == 2
-    along = (SERIES, "time") if panel else ("time",)
+    panel = () if labels.series is None else (labels.series,)
+    along = (*panel, "time")
     coords: dict[str, Any] = {"chain": np.arange(chains), "draw": np.arange(samples)}
-    clock: dict[str, Any] = {} if per_series else {"time": ("time", times, units_attribute(["time"], units))}
+    clock: dict[str, Any] = _clock("time", times, panel, units)
     outputs = labels.coords.get(OUTPUT, list(model.output_names))
     units = units | {new: units[old] for old, new in zip(model.output_names, outputs, strict=True) if old in units}
     named = {"output": outputs, "state": list(model.state_names), "force": list(model.force_names),
@@ -166,15 +176,13 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
     # A time at which nothing was observed has no predictive density to compare.
     seen = np.flatnonzero(np.isfinite(np.asarray(y)).any(axis=-1).reshape(-1, np.shape(y)[-2]).any(axis=0))
     sample = ("chain", "draw", *along)
-    which = {SERIES: labels.coords[SERIES]} if panel and SERIES in labels.coords else {}
+    which = {name: labels.coords[name] for name in panel}
     observed_coords = {**clock, **which, "output": named["output"]}
     groups = {
         "posterior": _posterior(draws, coords, named, labels),
         "sample_stats": xr.Dataset({k: (("chain", "draw"), v) for k, v in stats.items()}, coords),
         "observed_data": xr.Dataset({site.name: variable((*along, "output"), y, named["output"])}, observed_coords),
     }
-    if per_series:
-        groups["observed_data"] = groups["observed_data"].assign(times=(along, times))
     if scores is not None:
         split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in scores.items()}
         left_out = xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock, **which})
@@ -189,7 +197,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
         groups["posterior_predictive"] = xr.Dataset(
             {site.name: variable((*sample, "output"), paths["y"], named["output"])}, {**thinned, **observed_coords})
         dimensions = ("chain", "draw", *panel, "at")
-        at_coords = {} if grid is None else {"at": ("at", grid, units_attribute(["time"], units))}
+        at_coords = {} if grid is None else _clock("at", grid, panel, units)
         groups["trajectories"] = xr.Dataset(
             {f"{kind}s": variable((*dimensions, kind), paths[kind], named[kind])
              for kind in named if paths[kind].shape[-1]},
@@ -199,7 +207,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
             groups["trajectories"]["forces"].attrs[PERIODS] = json.dumps(periods)
         groups["trajectories"] = with_summaries(groups["trajectories"], paths)
         if "prediction" in paths and grid is not None:
-            groups[GROUP] = predictions(bound, paths, np.asarray(draw_index), grid, labels.coords)
+            groups[GROUP] = predictions(bound, paths, np.asarray(draw_index), grid, labels.coords, labels.series)
     if truth:
         groups["truth"] = _truth(truth, named, units, groups["posterior"])
         for kind, values in _true_functions(bound, truth, draws).items():
@@ -209,6 +217,12 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
                 truth_group = truth_group.drop_dims(kind)
             groups["truth"] = truth_group.assign(new).assign_coords({kind: named[kind]})
     return groups
+
+
+def _clock(name: str, times: np.ndarray, panel: tuple[str, ...], units: Mapping[str, str]) -> dict[str, Any]:
+    """Return the coordinate of times along a dimension, (K,), or (B, K) of series that have their own."""
+    label, dims = (name, (name,)) if times.ndim == 1 else (TIMES, (*panel, name))
+    return {label: (dims, times, units_attribute(["time"], units))}
 
 
 def force_periods(model: LatentForceModel) -> dict[str, float]:

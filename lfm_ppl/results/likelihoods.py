@@ -2,12 +2,14 @@
 
 1. The Gaussian filter, with its own steps, with half of them, and as stored in a result.
 2. A Fokker-Planck grid for models of one state; one grid serves all draws.
-3. A particle filter; a pilot run chooses the number of particles. Linear models with an observation family use
-   importance sampling by draws of the smoother instead.
+3. A particle filter; a pilot run chooses the number of particles. Where that number takes long, fewer come first, and
+   more only until the verdict is settled. Linear models with an observation family use importance sampling by draws of
+   the smoother instead.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -30,7 +32,7 @@ from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles import particle_filter
 from lfm_ppl.particles.particle_filter import ParticleSettings
-from lfm_ppl.utils.progress import Console
+from lfm_ppl.utils.progress import Console, duration
 
 _PILOT = 8
 """Draws that the pilot run takes."""
@@ -90,7 +92,8 @@ class Reference:
     """Log likelihoods of a reference.
 
     Attributes:
-        estimates: (S, R) log likelihoods, R replicates of an unbiased estimate, or R = 1 where they are exact.
+        estimates: (S, B, R) log likelihoods of each series, R replicates of an unbiased estimate; (S, 1, 1) where they
+            are exact, summed over the series.
         description: of the method, in words.
         particles: in each replicate; zero where there are none.
         limited: whether more particles were wanted than the limit on work allows.
@@ -196,7 +199,7 @@ def on_grid(problem: LikelihoodProblem, settings: ReferenceSettings) -> Referenc
 
     log_likelihoods = _map_sequentially(problem, jax.random.key(0), ("Fokker-Planck grid", layout, steps), per_draw,
                                         settings.show_progress)
-    return Reference(log_likelihoods[:, None], f"Fokker-Planck equation on a grid of {layout.cells} cells")
+    return Reference(log_likelihoods[:, None, None], f"Fokker-Planck equation on a grid of {layout.cells} cells")
 
 
 def takes_smoother_draws(ssm: StateSpaceModel) -> bool:
@@ -205,44 +208,66 @@ def takes_smoother_draws(ssm: StateSpaceModel) -> bool:
 
 
 def by_particles(problem: LikelihoodProblem, settings: ReferenceSettings, noise: Callable[[np.ndarray], float],
-                 target: float, most_work: float) -> Reference:
+                 target: float, most_work: float, is_settled: Callable[[np.ndarray], bool] | None = None) -> Reference:
     """Return replicates of the particle filter's estimates, or of importance sampling where `takes_smoother_draws`.
 
     Without a number of particles, a pilot run at a few draws determines the number at which the noise of the averaged
-    estimate of a draw is below ``target``: the variance is inversely proportional to it.
+    estimate of a draw is below ``target``: the variance is inversely proportional to it. If that takes minutes, a run
+    with fewer particles comes first, and others with four times as many until ``is_settled``.
 
     Args:
         problem: the draws.
         settings: settings of the particle filter.
-        noise: maps estimates (S, R) to the sd of their averages.
+        noise: maps estimates (S, B, R) to the sd of their averages, summed over the series.
         target: largest sd.
-        most_work: limit on the number of particle steps, which limits the number of particles.
+        most_work: limit on the number of particle steps times states, which limits the number of particles.
+        is_settled: maps estimates to whether more particles would change nothing; None: they always do.
     """
     example = problem.example
     pilot_key, key = jax.random.split(jax.random.key(settings.seed))
     limited = False
     count, replicates = settings.particles or _FIRST_PARTICLES, settings.replicates
-    run = _particle_run(problem, count, settings)
+    final_count = count
     if settings.particles is None:
         rows = np.unique(np.linspace(0, problem.size - 1, _PILOT).round().astype(int))
         stores = problem.stores
         pilot_stores = None if stores is None else lambda name: stores(f"pilot {name}")
-        sd = noise(run(replace(problem.select(rows), stores=pilot_stores), pilot_key))
+        pilot = _particle_run(problem, count, settings)
+        sd = noise(pilot(replace(problem.select(rows), stores=pilot_stores), pilot_key))
         needed_particles = count * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
         time_grid = build_time_grid(example.ssm, example.times, settings.steps or example.steps, example.max_step)
         steps_made = np.shape(time_grid.intervals.length)[0] * time_grid.steps
-        each_particle = problem.size * replicates * problem.series * steps_made
+        each_particle = problem.size * replicates * problem.series * steps_made * example.ssm.state_dim
         most = max(count, most_work / each_particle)
         limited = needed_particles > most
         if needed_particles > count and most > count:
-            count = int(np.ceil(min(needed_particles, most) / 500) * 500)
-            run = _particle_run(problem, count, settings)
+            final_count = _rounded(min(needed_particles, most))
+        count = max(count, min(final_count, _rounded(_FIRST_WORK / each_particle)))
+    while True:
+        start_time = time.perf_counter()
+        estimates = _particle_run(problem, count, settings)(problem, key)
+        if count >= final_count or (is_settled is not None and is_settled(estimates)):
+            break
+        more = min(4 * count, final_count)
+        if settings.show_progress:
+            seconds = more / count * (time.perf_counter() - start_time)
+            Console()(f"{count:,} particles leave too much noise; {more:,} take about {duration(seconds)}")
+        count = more
     method = (f"importance sampling, {replicates} runs of {count:,} draws of the smoother" if takes_smoother_draws(
         example.ssm) else f"particle filter, {replicates} runs of {count:,} particles")
-    return Reference(run(problem, key), f"{method} a draw", count, limited)
+    return Reference(estimates, f"{method} a draw", count, limited and count >= final_count)
+
+
+def _rounded(particles: float) -> int:
+    """Return a number of particles, rounded up to 500."""
+    return int(np.ceil(particles / 500) * 500)
 
 
 _FIRST_PARTICLES = 1000
+
+_FIRST_WORK = 2e9
+"""Particle steps times states of a first run: a minute on two cores."""
+
 _SAFETY = 1.2
 """Factor on the number of particles of the pilot run, which is an estimate."""
 
@@ -268,9 +293,11 @@ def _particle_run(problem: LikelihoodProblem, particles: int, settings: Referenc
 
         def replicate(key: jax.Array) -> jax.Array:
             keys = jax.random.split(key, series) if isinstance(distribution, Panel) else key
-            return map_series(distribution, series_log_likelihood, y, keys).sum()
+            return jnp.reshape(map_series(distribution, series_log_likelihood, y, keys), (series,))
 
-        return jax.lax.map(replicate, jax.random.split(key, settings.replicates))
+        # Replicates of each series are averaged apart: their product over the series is noisier than the product of
+        # their averages.
+        return jax.lax.map(replicate, jax.random.split(key, settings.replicates)).T
 
     def run(problem: LikelihoodProblem, key: jax.Array) -> np.ndarray:
         name = (f"particle filter, {particles:,} particles", filter_settings, settings.replicates, steps)

@@ -43,25 +43,26 @@ MEAN, SD, FREE_SD = "y_mean", "y_sd", "outputs_sd"
 
 
 def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], draw_index: np.ndarray, times: np.ndarray,
-                labels: Mapping[str, Any] | None = None) -> xr.Dataset:
+                labels: Mapping[str, Any] | None = None, series: str | None = None) -> xr.Dataset:
     """Lay out new observations, and the paths that they were drawn along.
 
     Args:
         bound: the model and its data.
         paths: what `lfm_ppl.inference.posterior.trajectories` drew, each (C, S, ..., K, size).
         draw_index: (S,), draws of each chain.
-        times: (K,).
-        labels: dimension -> names of "output" and "series", where they are not the model's.
+        times: (K,), or (B, K) for each series of a panel.
+        labels: dimension -> names, of "output" where they are not the model's, and of the series of a panel.
+        series: dimension of the series of a panel; None for one series.
 
     Returns:
-        Variables with dimensions chain, draw, (series,) time and one more: the site's name (new observations, with
-        noise); for Gaussian observations ``y_mean`` and ``y_sd`` (normal distribution of one at each draw; the
-        predictive density is their mixture) and ``outputs_sd`` (its sd without the noise, zero where it is that given a
-        path); ``outputs`` (noise-free), ``forces``, ``states`` and ``deterministics``.
+        Variables with dimensions chain, draw, (that of the series,) time and one more: the site's name (new
+        observations, with noise); for Gaussian observations ``y_mean`` and ``y_sd`` (normal distribution of one at each
+        draw; the predictive density is their mixture) and ``outputs_sd`` (its sd without the noise, zero where it is
+        that given a path); ``outputs`` (noise-free), ``forces``, ``states`` and ``deterministics``.
     """
     site = bound.site
     model = site.example.ssm.model
-    panel = ("series",) if np.ndim(bound.y) == 3 else ()
+    panel = () if series is None else (series,)
     labels = labels or {}
     outputs = list(labels.get("output", model.output_names))
     units = {new: model.units[old] for old, new in zip(model.output_names, outputs, strict=True) if old in model.units}
@@ -83,9 +84,10 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], draw_index: 
     words = {"output": NOISE_FREE, "state": "state", "force": "force", "deterministic": "of state and forces"}
     variables |= {f"{kind}s": variable(kind, paths[kind], word) for kind, word in words.items()
                   if paths[kind].shape[-1]}
-    clock = {"time": ("time", times, units_attribute(["time"], units))}
+    clock = {("times" if np.ndim(times) == 2 else "time"): (
+        (*panel, "time")[-np.ndim(times):], times, units_attribute(["time"], units))}
     coords = {"chain": np.arange(paths["prediction"].shape[0]), "draw": draw_index, **clock}
-    coords |= {"series": labels["series"]} if panel and "series" in labels else {}
+    coords |= {name: labels[name] for name in panel if name in labels}
     attrs = {"observed": site.name, "last_observation": float(last_observation(bound.times, np.asarray(bound.y)))}
     return xr.Dataset(variables, {**coords, **{kind: names for kind, names in named.items() if names}}, attrs)
 

@@ -15,6 +15,7 @@ from lfm_ppl.inference.likelihood_site import LikelihoodSite
 from lfm_ppl.io.data_set import InputTable, as_doses, model_keywords
 from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.results.likelihoods import LikelihoodProblem
+from lfm_ppl.results.series import TIMES, times_of
 
 _TOLERANCE = 1e-6
 """Relative difference of log likelihoods between machines and versions that is rounding."""
@@ -30,12 +31,11 @@ def observations(result: Any) -> tuple[np.ndarray, np.ndarray]:
         ValueError: the result holds no data.
     """
     data = arviz_data.group(result, "observed_data")
-    names = [name for name in data.data_vars if name != "times"]
-    if len(names) != 1 or ("times" not in data and "time" not in data.coords):
+    names = [name for name in data.data_vars if name != TIMES]
+    if len(names) != 1 or not {TIMES, "time"} & set(data.variables):
         raise ValueError(f"the group observed_data holds {', '.join(map(str, data.variables)) or 'nothing'}; expected "
                          "one variable of observations and their times. Pass times and y.")
-    times = data["times"] if "times" in data else data["time"]
-    return np.asarray(times.values, float), np.asarray(data[names[0]].values, float)
+    return np.asarray(times_of(data).values, float), np.asarray(data[names[0]].values, float)
 
 
 def keywords(result: Any, later: Mapping[str, Any] | None, overrides: Mapping[str, Any] | None) -> dict[str, Any]:

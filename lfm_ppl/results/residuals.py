@@ -17,6 +17,7 @@ import xarray as xr
 from scipy import stats
 
 from lfm_ppl.results.arviz_data import attributes, group, has_group
+from lfm_ppl.results.series import series_dimension
 
 MIN_OBSERVATIONS = 8
 _FAR, _RARE = 3.0, 1e-3
@@ -133,8 +134,7 @@ def misfit(result: Any) -> list[str]:
     """
     attrs = attributes(result)
     is_approximate = "constraints" in attrs or str(attrs.get("sampler", "")).startswith("pmmh")
-    if is_approximate or not has_group(result, "one_step_ahead") or (
-            "series" in group(result, "one_step_ahead")["residual"].dims):
+    if is_approximate or not has_group(result, "one_step_ahead") or series_dimension(result) is not None:
         return []
     remedy = "" if "sites" in attrs else " (lfm.StudentTObservation)"
     messages, residual, tests = [], mean_residuals(result), residual_tests(result)

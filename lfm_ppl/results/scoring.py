@@ -243,6 +243,9 @@ def aligned(predicted: xr.Dataset, variable: xr.DataArray, held_out: Any,
     """
     outputs = [str(name) for name in variable["output"].values]
     if isinstance(held_out, (Data, xr.DataArray)):
+        if "time" not in predicted.indexes:
+            raise ValueError("held_out must be an array (B, K, D), as the series of the predictions have their own "
+                             f"times; got {type(held_out).__name__}.")
         times, y, names = _labelled(held_out)
         for name in names:
             if name not in outputs:

@@ -34,6 +34,9 @@ NOISE_SD = 0.3
 CORRECT = "lfm-ppl check RESULT --correct"
 """The command that samples the exact posterior, where no weights can be relied on."""
 
+NOISE_SHARE = 0.5
+"""Share of noise in the variance of the log ratios from which unreliable weights say nothing of the filter."""
+
 LEAST_DRAWS = 40
 """Fewer draws have no tail to fit a Pareto distribution to."""
 
@@ -189,7 +192,7 @@ def _unreliable(findings: Findings) -> tuple[str, str, str]:
     digits = 2 if f"{findings.k:.2f}" != f"{findings.threshold:.2f}" else 4
     start = (f"k = {findings.k:.{digits}f} is not below {findings.threshold:.{digits}f}, so that the importance "
              "weights cannot be relied on")
-    if findings.noise_share > 0.5:
+    if findings.noise_share > NOISE_SHARE:
         reason = (f"{start}; {findings.noise_share:.0%} of the variance of the log ratios is noise of the particle "
                   "filter, which makes k larger.")
         return "inconclusive", reason, f"lfm-ppl check RESULT --particles {4 * findings.particles} --overwrite"

@@ -63,11 +63,25 @@ def _bind(numpyro_model: Callable, times: Any, y: Any, model_kwargs: dict[str, A
                         "lfm.read_table(frame, inputs=[...]), or give lfm.Data(..., inputs={...}).") from error
 
 
-def check_requested_times(bound: BoundModel, times: Any) -> None:
-    """Check the times of the trajectories before sampling; None: a grid over the data."""
+def check_requested_times(bound: BoundModel, times: Any, name: str = "at") -> None:
+    """Check the times of trajectories, (K,), or (B, K) for each series; None: a grid over the data.
+
+    Raises:
+        ValueError: a wrong shape; a time before the initial time.
+    """
     if times is None:
         return
-    if bound.times.ndim != 1:
-        raise ValueError("`at` needs one vector of times for all series; this panel has times of its own for each.")
     example = bound.site.example
-    build_time_grid(example.ssm, bound.times, example.steps, example.max_step, times, tolerance=example.tolerance)
+    has_series_times = bound.times.ndim == 2
+    if np.ndim(times) > 1 and not (has_series_times and np.shape(times)[:-1] == (len(bound.times),)):
+        expected = f"(K,), or ({len(bound.times)}, K) for each series" if has_series_times else "(K,)"
+        raise ValueError(f"{name} must have shape {expected}, got {np.shape(times)}.")
+    if not has_series_times:
+        build_time_grid(example.ssm, bound.times, example.steps, example.max_step, times, tolerance=example.tolerance)
+        return
+    rows = times if np.ndim(times) == 2 else [times] * len(bound.times)
+    for series, (data_times, row) in enumerate(zip(bound.times, rows, strict=True)):
+        try:
+            build_time_grid(example.ssm, data_times, example.steps, None, row, tolerance=example.tolerance)
+        except ValueError as error:
+            raise ValueError(f"series {series}: {error}") from None

@@ -40,6 +40,7 @@ from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.layout import Labels, checked_truth
+from lfm_ppl.results.series import SERIES
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import waiting
 from lfm_ppl.utils.types import Result, Times
@@ -148,8 +149,9 @@ def fit(
         attributes: further attributes of the result.
         dims: parameter -> names of its dimensions, ``{"decay": ["gene"]}``. By default the plates around it,
             ``event_dims`` of NumPyro's ``infer``, and "output" for a vector with one entry for each output.
-        coords: dimension -> labels, ``{"gene": ["CDKN1A", "SESN1"]}``, also of the dimensions "output" (columns of y)
-            and "series" (series of a panel). By default the column names of a data frame are the labels of "output".
+        coords: dimension -> labels, ``{"gene": ["CDKN1A", "SESN1"]}``, also of the dimension "output" (columns of y)
+            and of the plate of a panel, whose name is the dimension of the series. By default the column names of a
+            data frame are the labels of "output", and series have the labels of an xarray DataArray, or numbers.
 
     Ctrl-C ends the sampling after the present block of steps, about two seconds. With a ``checkpoint`` the finished
     draws are returned, with an attribute ``partial`` and a warning; without one they are the attribute ``result`` of
@@ -215,7 +217,7 @@ def fit(
     if y is None:
         data = as_data(times)
         times, y = data.times, data.y
-        coords = {"output": data.outputs, **(coords or {})}
+        coords = {"output": data.outputs, **({SERIES: data.series} if data.series else {}), **(coords or {})}
     bound, data, clock = bind_dates(numpyro_model, times, y, data, model_kwargs)
     if data is not None:
         truth = data.truth if truth is None else truth

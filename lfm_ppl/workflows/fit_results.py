@@ -208,15 +208,27 @@ def draw_paths(key: jax.Array, bound: BoundModel, values: Mapping[str, np.ndarra
     return TrajectoryDraws(draw_indices, by_chain, times)
 
 
-def _trajectory_times(bound: BoundModel, requested_times: Any) -> np.ndarray | None:
-    times = bound.times
-    if times.ndim > 1:
-        return None
+def _trajectory_times(bound: BoundModel, requested_times: Any) -> np.ndarray:
+    """Return the times of the trajectories, (K,), or (B, K) on grids of series that have their own times."""
     if requested_times is not None:
         return np.atleast_1d(np.asarray(requested_times, float))
-    origin = float(bound.site.example.time_grid.initial_time)
-    nodes = np.union1d(min(origin, times[0]), times)
-    span, periods = nodes[-1] - nodes[0], force_periods(bound.site.example.ssm.model).values()
+    model = bound.site.example.ssm.model
+    periods = list(force_periods(model).values())
+    if bound.times.ndim == 1:
+        return _default_grid(bound.times, model.initial_time, periods)
+    return pad_grids([_default_grid(times, model.initial_time, periods) for times in bound.times])
+
+
+def pad_grids(grids: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the times of several series, (B, K), where shorter ones repeat their last time."""
+    longest = max(map(len, grids))
+    return np.array([np.pad(grid, (0, longest - len(grid)), "edge") for grid in grids])
+
+
+def _default_grid(times: np.ndarray, initial_time: Any, periods: Sequence[float]) -> np.ndarray:
+    """Return times that show a trajectory over the data of one series."""
+    nodes = np.union1d(times[0] if initial_time is None else min(float(initial_time), times[0]), times)
+    span = nodes[-1] - nodes[0]
     points = max([_GRID_POINTS, *(int(16 * span / period) for period in periods)])
     grid = subdivide(nodes, min(points, 5 * _GRID_POINTS))
     for period in periods:

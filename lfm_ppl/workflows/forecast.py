@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.posterior import evenly_spaced, noise_of_rows, trajectories
 from lfm_ppl.io.data_set import InputTable
 from lfm_ppl.model.inputs import Input
@@ -16,9 +15,11 @@ from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results import inputs as known_inputs
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
+from lfm_ppl.results.series import series_dimension
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import Console
 from lfm_ppl.utils.types import Result, Times
+from lfm_ppl.workflows.data_binding import check_requested_times
 
 
 def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: Mapping[str, Any] | None = None,
@@ -45,6 +46,7 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
         result: of `lfm_ppl.fit`, or read by `lfm_ppl.load`.
         numpyro_model: the model that was fitted. A result holds draws and data, but no code.
         times: (K,) times of the forecast, non-decreasing, from the initial time on; dates if the data have dates.
+            (B, K) where the series of a panel have times of their own.
         inputs: known inputs (`lfm_ppl.Input`) that reach as far as ``times``, and are the same as before at the data:
             inputs by name, or keyword arguments of the model, that replace the ones of the result. Doses are
             (times, amounts, "dose:STATE"), with all those before.
@@ -62,8 +64,8 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
 
     Raises:
         ValueError: times that go back or lie before the initial time; another model than that of the result, seen by
-            its settings, its parameters or its log likelihood at the draws; a known input that ends before ``times``; a
-            panel whose series have times of their own; noise whose covariance is given row by row.
+            its settings, its parameters or its log likelihood at the draws; a known input that ends before ``times``;
+            noise whose covariance is given row by row.
         TypeError: ``result`` is no ArviZ object.
 
     Example:
@@ -88,7 +90,11 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
     """
     checks.positive_integer("draws", draws)
     clock = known_inputs.clock_of(result)
-    times = checks.time_vector("times", calendar_time.positions("times", times, *clock), order="non-decreasing")
+    times = calendar_time.positions("times", times, *clock)
+    if np.ndim(times) == 2:
+        times = np.array([checks.time_vector("times", row, order="non-decreasing") for row in times])
+    else:
+        times = checks.time_vector("times", times, order="non-decreasing")
     with calendar_time.in_messages(*clock):
         return _forecast(result, numpyro_model, times, inputs, model_kwargs, draws, seed, progress)
 
@@ -119,8 +125,9 @@ def _forecast(result: Any, numpyro_model: Callable, times: np.ndarray, inputs: M
         HELD_OUT, known_inputs.FORECAST)}
     labels = posterior["draw"].values[draw_index] if "draw" in posterior.coords else draw_index
     observed = groups["observed_data"]
-    names = {name: observed[name].values.tolist() for name in ("output", "series") if name in observed.coords}
-    groups[GROUP] = predictions(bound, split, labels, times, names)
+    series = series_dimension(result)
+    names = {str(name): observed[name].values.tolist() for name in ("output", series) if name in observed.coords}
+    groups[GROUP] = predictions(bound, split, labels, times, names, series)
     if continued := {name: InputTable(*value) if isinstance(value, tuple) else InputTable(
             np.asarray(value.times), np.asarray(value.values), value.interpolation)
                      for name, value in (inputs or {}).items() if isinstance(value, Input | tuple)}:
@@ -134,15 +141,11 @@ def check_possible(bound: Any, times: np.ndarray) -> None:
     Raises:
         ValueError: see `forecast`.
     """
-    if bound.times.ndim != 1:
-        raise ValueError("a forecast needs one vector of times for all series; this panel has times of its own for "
-                         "each.")
     example = bound.site.example
     if noise_of_rows(example):
         raise ValueError("the covariance of the observation, (T, D, D), or a parameter of its family, (T, D), is given "
                          "for each row of the data, so that there is none at other times. For a forecast give a "
                          "function (x, u, t) as covariance, or one number for all rows; what differs from row to row, "
                          "such as an exposure, can be a known input of the predictor.")
-    build_time_grid(example.ssm, bound.times, example.steps, example.max_step, times, tolerance=example.tolerance)
-    model = example.ssm.model
-    model.check_span(float(bound.times[0]), float(max(times.max(), bound.times[-1])))
+    check_requested_times(bound, times, "times")
+    example.ssm.model.check_span(float(bound.times.min()), float(max(times.max(), bound.times.max())))

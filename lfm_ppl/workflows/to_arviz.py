@@ -92,7 +92,7 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: ArrayLike, y: ArrayLike,
     if trajectory_draws != 0:
         checks.positive_integer("trajectory_draws", trajectory_draws)
     draws, stats = _collected(mcmc)
-    values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
+    values = np.asarray(y.to_numpy(), float) if hasattr(y, "to_numpy") else y  # a data frame
     bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
     check_requested_times(bound, at)
     draws = _checked(bound, draws)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lfm_ppl.io.data import read_csv, read_series, read_table, write_csv
-from lfm_ppl.io.data_set import Data
+from lfm_ppl.io.data_set import Data, stack_series
 from lfm_ppl.io.truth import read_truth, write_truth
 
 P53 = "time_h,replicate,DDB2,CDKN1A\n0,1,211.6,5.9\n0,2,168.002,\n2,1,482.582,117.017\n"
@@ -173,3 +173,15 @@ def test_a_long_file_is_read_series_by_series(write):
 def test_times_out_of_order_are_to_be_sorted(write, text):
     with pytest.raises(ValueError, match="Sort the rows by time"):
         read_csv(write(text), outputs=["x"])
+
+
+def test_series_are_stacked_with_rows_all_missing_and_one_origin(write):
+    path = write("date,x,who\n2026-01-05 06:00,1,b\n2026-01-04 12:00,2,a\n2026-01-05 18:00,3,b\n")
+    panel = stack_series(read_series(path, "who", time_unit="h"))
+    assert panel.series == ("b", "a") and panel.origin == "2026-01-04T00:00:00"
+    np.testing.assert_array_equal(panel.times, [[30.0, 42.0], [12.0, 12.0]])
+    np.testing.assert_array_equal(panel.y[..., 0], [[1.0, 3.0], [2.0, np.nan]])
+    with pytest.raises(ValueError, match="known input"):
+        stack_series({"a": Data([0.0], [[1.0]], ("x",), inputs={"dose": ([0.0], [1.0])})})
+    with pytest.raises(ValueError, match="'b'"):
+        stack_series({"a": Data([0.0], [[1.0]], ("x",)), "b": Data([0.0], [[1.0]], ("z",))})

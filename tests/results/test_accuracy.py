@@ -353,6 +353,28 @@ def test_enough_particles_are_found(bent):
     assert limited.particles == 1000 and limited.limited
 
 
+def test_more_particles_are_run_only_until_the_verdict_is_settled(bent, monkeypatch):
+    problem = rebuilding.problem(bent, well).select(np.arange(0, 400, 50))
+    settings = likelihoods.ReferenceSettings("particles", None, 2)
+    monkeypatch.setattr(likelihoods, "_FIRST_WORK", 1.0)
+    shapes, answers = [], iter([False, True])
+
+    def is_settled(estimates):
+        shapes.append(estimates.shape)
+        return next(answers)
+
+    result = likelihoods.by_particles(problem, settings, lambda estimates: 3.0, 0.3, 1e12, is_settled)
+    assert result.particles == 4000 and not result.limited and shapes == [(8, 1, 2)] * 2
+
+
+def test_replicates_of_each_series_are_averaged_apart():
+    likelihood = np.array([[[1.0, 3.0], [2.0, 6.0]]])  # one draw, two series, two replicates
+    averaged = accuracy._summed(np.log(likelihood))
+    np.testing.assert_allclose(averaged.log_mean, np.log(2.0 * 4.0))
+    parts = importance.average(np.log(likelihood[0]))
+    np.testing.assert_allclose(averaged.variance, parts.variance.sum())
+
+
 @pytest.mark.parametrize(("changes", "name"), [
     ({"reference": "exact"}, "reference"), ({"draws": 0}, "draws"), ({"particles": 0}, "particles"),
     ({"replicates": 1}, "replicates"), ({"steps": 0}, "steps"), ({"y": Y[:3]}, "y"),

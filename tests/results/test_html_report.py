@@ -172,7 +172,7 @@ def test_a_panel(groups, attrs, tmp_path):
                                  data_vars="all")
     page = read(save(groups, attrs, tmp_path / "a.html"))
     assert "7 of 84 values" in page.texts["data"]
-    assert "Series p4" in page.texts["forecast"] and "Series p5" not in page.texts["forecast"]
+    assert "series p4" in page.texts["forecast"] and "series p5" not in page.texts["forecast"]
 
 
 def test_figures_are_drawn_and_a_failed_figure_is_named(groups, tmp_path, monkeypatch):

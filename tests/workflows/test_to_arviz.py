@@ -123,7 +123,7 @@ def panel_model(times, y=None):
 
 
 @pytest.mark.slow
-def test_the_series_of_a_panel_have_one_name_everywhere():
+def test_the_plate_of_a_panel_is_a_dimension_of_every_group():
     draws, labels = {"decay": np.full((1, 4, 3), 0.5)}, ["Ann", "Bo", "Cy"]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -131,7 +131,7 @@ def test_the_series_of_a_panel_have_one_name_everywhere():
                               trajectory_draws=2)
     assert list(arviz_data.summary(result).index) == ["decay[Ann]", "decay[Bo]", "decay[Cy]"]
     for name in ("observed_data", "log_likelihood", "trajectories", "posterior_predictive"):
-        assert group(result, name)["series"].values.tolist() == labels
+        assert group(result, name)["patient"].values.tolist() == labels
 
 
 def test_wrong_names_and_runs_are_refused(mcmc):

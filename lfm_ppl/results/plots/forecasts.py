@@ -18,6 +18,7 @@ from lfm_ppl.results.arviz_data import group, has_group
 from lfm_ppl.results.inputs import FORECAST
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, INTERVAL, MEAN, interval, noise_free_interval
+from lfm_ppl.results.series import times_of
 
 NOISE_FREE, PREDICTIVE = "#8FBFDE", "#D3E4F1"
 """Tints of blue: bands of noise-free outputs and of new data."""
@@ -29,11 +30,11 @@ _SMALLEST_SHARE, _FEWEST_ROWS = 0.2, 20
 
 
 def series_predictions(result: Any) -> xr.Dataset | None:
-    """Return the predictions of one series; None where there are none."""
+    """Return the predictions of one series, or of all series of a panel; None where there are none."""
     if not has_group(result, GROUP):
         return None
     dataset = group(result, GROUP)
-    return None if "series" in dataset.dims else dataset.drop_duplicates("time")
+    return dataset.drop_duplicates("time") if "time" in dataset.indexes else dataset
 
 
 def forecast_span(result: Any) -> tuple[float, float]:
@@ -41,7 +42,7 @@ def forecast_span(result: Any) -> tuple[float, float]:
     predicted = series_predictions(result)
     if predicted is None or predicted.sizes["time"] == 0:
         return -np.inf, -np.inf
-    end = float(predicted["time"].values.max())
+    end = float(times_of(predicted).values.max())
     return float(predicted.attrs.get("last_observation", end)), end
 
 
@@ -49,7 +50,7 @@ def is_made_later(result: Any) -> bool:
     """Return whether the predictions reach beyond the data and the trajectories of the fit."""
     last, end = forecast_span(result)
     return last < end and not (has_group(result, "trajectories") and
-                               group(result, "trajectories")["at"].values.max() >= end)
+                               times_of(group(result, "trajectories"), "at").values.max() >= end)
 
 
 def without_forecast(result: Any) -> Any:

@@ -9,12 +9,12 @@ Source: Ljung and Box (1978), Biometrika 65.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -22,7 +22,7 @@ from matplotlib.ticker import MaxNLocator
 from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.plots.trajectories import pick
+from lfm_ppl.results.plots.trajectories import pick, series_views
 from lfm_ppl.results.residuals import (
     autocorrelation,
     default_lags,
@@ -36,20 +36,23 @@ _ENVELOPE = "#DDDDDD"
 
 
 @style.styled
-def plot_residuals(result: Any, outputs: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
+def plot_residuals(result: Any, outputs: Sequence[str] | None = None, *, series: Any = None,
+                   width: str | float = "column") -> Figure:
     """Draw the standardised one-step-ahead residuals of each output in three panels.
 
     Over time: posterior means, with the 95% interval over the draws as a thin bar, and the lines
     within which 95% of N(0, 1) lie. Normal Q-Q: with the pointwise 95% envelope of an N(0, 1)
-    sample. Autocorrelation: with the 95% bounds of white noise. p-values stand above the panels.
+    sample. Autocorrelation: with the 95% bounds of white noise. p-values stand above the panels. Of several series of a
+    panel it draws the residuals over time, in one panel for each.
 
     Args:
         result: with the group one_step_ahead.
         outputs: names; None for all, up to 4.
+        series: labels or positions of series of a panel; None for all, up to a dozen.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
     Returns:
-        A figure with three panels per output.
+        A figure with three panels per output, or with one for each output of each series.
 
     Raises:
         ValueError: the group is missing, or an output is unknown.
@@ -63,21 +66,41 @@ def plot_residuals(result: Any, outputs: Sequence[str] | None = None, *, width: 
         >>> [axes.get_title(loc="left") for axes in figure.axes]
         ['position', 'KS p = 0.56', 'Ljung-Box p = 0.11']
     """
-    draws = group(result, "one_step_ahead")["residual"].transpose("chain", "draw", "time", "output")
-    names, note = style.first_of(pick(draws, "output", outputs), outputs, MAX_OUTPUTS, "outputs")
+    residual = group(result, "one_step_ahead")["residual"]
+    names, note = style.first_of(pick(residual, "output", outputs), outputs, MAX_OUTPUTS, "outputs")
+    views, remark = series_views(result, series, len(names))
+    note = f"{remark} {note}".strip()
+    if len(views) > 1:
+        return _draw_series(views, names, note, width)
+    ((title, result),) = views.items()
     means, tests = mean_residuals(result), residual_tests(result)
     figure, rows = _panels(width, len(names))
     for name, (over_time, quantiles, lags) in zip(names, rows, strict=True):
-        series = means.sel(output=name)
-        _draw_over_time(over_time, series, draws.sel(output=name))
-        over_time.set_title(name, fontweight="bold")
+        values = means.sel(output=name)
+        _draw_over_time(over_time, result, name)
+        over_time.set_title(f"{title}, {name}" if title else name, fontweight="bold")
         over_time.set_ylabel("residual (sd)")
-        _draw_quantiles(quantiles, series.values, tests.loc[name])
-        _draw_autocorrelation(lags, series.values, tests.loc[name])
+        _draw_quantiles(quantiles, values.values, tests.loc[name])
+        _draw_autocorrelation(lags, values.values, tests.loc[name])
     style.label_time([row[0] for row in rows], time_unit(result), time_origin(result))
     for row in rows if style.is_narrow(width) else rows[-1:]:
         row[1].set_xlabel("normal quantile")
         row[2].set_xlabel("lag (observations)")
+    style.legend_above(figure)
+    if note:
+        style.note_below(figure, note)
+    return figure
+
+
+def _draw_series(views: Mapping[str, Any], names: Sequence[str], note: str, width: str | float) -> Figure:
+    """Draw the residuals over time of each output of each series."""
+    figure, panels = style.small_multiples(width, len(views) * len(names), 1.25)
+    for axes, (name, (title, view)) in zip(panels, itertools.product(names, views.items()), strict=True):
+        _draw_over_time(axes, view, name)
+        axes.set_title(f"{title}, {name}" if len(names) > 1 else title)
+        axes.set_ylabel("residual (sd)")
+    view = next(iter(views.values()))
+    style.label_time(panels, time_unit(view), time_origin(view))
     style.legend_above(figure)
     if note:
         style.note_below(figure, note)
@@ -103,7 +126,10 @@ def _panels(width: str | float, count: int) -> tuple[Figure, list[tuple[Axes, Ax
     return figure, rows
 
 
-def _draw_over_time(axes: Axes, series: xr.DataArray, draws: xr.DataArray) -> None:
+def _draw_over_time(axes: Axes, result: Any, name: str) -> None:
+    """Draw the residuals of an output over time, of a result of one series."""
+    draws = group(result, "one_step_ahead")["residual"].transpose("chain", "draw", "time", "output").sel(output=name)
+    series = mean_residuals(result).sel(output=name)
     times = series["time"].values
     axes.axhspan(-1.96, 1.96, color=_ENVELOPE, lw=0, zorder=0, label="95% if the model holds")
     axes.axhline(0.0, color=style.GREY, lw=0.6, zorder=1)

@@ -15,6 +15,7 @@ from lfm_ppl.results.arviz_data import group, has_group, of_mode
 from lfm_ppl.results.inputs import inputs_of
 from lfm_ppl.results.plots import accuracy, chains, forecasts, inputs, pairs, residuals, trajectories
 from lfm_ppl.results.scalars import sampled
+from lfm_ppl.results.series import series_dimension, series_labels
 from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
 
 MAX_PAGES = 5
@@ -87,6 +88,7 @@ def save_figures(
 def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[str] | None]]:
     """Yield file name, function and the names to draw, for each page of each figure."""
     later = forecasts.is_made_later(result)
+    series = [] if series_dimension(result) is None else series_labels(result)
     for prefix in ("", "forecast-") if later else ("",):
         for kind, draw in _OVER_TIME.items():
             names = (list(inputs_of(result)) if kind == "inputs" else
@@ -94,8 +96,8 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[
             if kind == "fit" and not has_group(result, "observed_data"):
                 continue
             title = f"{prefix}{kind}".replace("forecast-fit", "forecast")
-            yield from _numbered(title, draw if prefix or not later else _of_the_fit(draw), names,
-                                 trajectories.MAX_PANELS)
+            draw = draw if prefix or not later else _of_the_fit(draw)
+            yield from _pages(title, draw, names, trajectories.MAX_PANELS, series if kind != "inputs" else [])
     if has_group(result, "posterior"):
         labels = sampled(group(result, "posterior"))
         if not of_mode(result):  # independent draws have no chains to look at
@@ -107,7 +109,7 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[
         residual = group(result, "one_step_ahead")["residual"]
         # An observation family may not know the probabilities that residuals are made of.
         names = [str(name) for name in residual["output"].values if residual.sel(output=name).notnull().any()]
-        yield from _numbered("residuals", residuals.plot_residuals, names, residuals.MAX_OUTPUTS)
+        yield from _pages("residuals", residuals.plot_residuals, names, residuals.MAX_OUTPUTS, series)
     if has_group(result, "accuracy"):
         yield "accuracy", accuracy.plot_accuracy, None
 
@@ -122,8 +124,22 @@ def _of_the_fit(draw: Draw) -> Draw:
     return wrapper
 
 
-def _numbered(title: str, draw: Draw, names: list[str], size: int) -> Iterator[tuple[str, Draw, list[str]]]:
-    pages = [names[start:start + size] for start in range(0, len(names), size)]
+def _pages(title: str, draw: Draw, names: list[str], size: int,
+           series: Sequence[Any]) -> Iterator[tuple[str, Draw, list[Any]]]:
+    """Yield the pages of a figure: ``size`` names on each, or these names of as many series as have room."""
+    if not series or not names:
+        yield from _numbered(title, draw, names, size)
+        return
+
+    @functools.wraps(draw)
+    def draw_series(result: Any, page: Sequence[Any], **options: Any) -> Figure:
+        return draw(result, names[:size], series=page, **options)
+
+    yield from _numbered(title, draw_series, series, trajectories.MAX_PANELS // min(size, len(names)))
+
+
+def _numbered(title: str, draw: Draw, names: Sequence[Any], size: int) -> Iterator[tuple[str, Draw, list[Any]]]:
+    pages = [list(names[start:start + size]) for start in range(0, len(names), size)]
     if len(pages) > MAX_PAGES:
         warnings.warn(
             f"{title}: drawing the first {MAX_PAGES * size} of {len(names)}; call "

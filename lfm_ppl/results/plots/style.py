@@ -284,14 +284,15 @@ def label_time(panels: Sequence[Axes], unit: str, origin: str = "") -> None:
             axes.set_xlabel(with_unit("time", f"{power} {unit}".strip(), 40))
 
 
-def label_values(axes: Axes, name: str, unit: str) -> None:
-    """Write ``name (unit)`` along the y axis; a name too long for it stands above the panel."""
+def label_values(axes: Axes, name: str, unit: str, title: str = "") -> None:
+    """Write ``name (unit)`` along the y axis; a title, and a name too long for the axis, stand above the panel."""
     unit = f"{scale(axes.yaxis)} {unit}".strip()
     if max(map(len, wrapped(name, _ROOM))) > _ROOM:
-        axes.set_title(name)
+        title = f"{title}, {name}" if title else name
         axes.set_ylabel(unit)
     else:
         axes.set_ylabel(with_unit(name, unit))
+    axes.set_title(title)
 
 
 def legend_above(figure: Figure, handles: Sequence[Any] = ()) -> None:

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -21,6 +22,7 @@ from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import forecasts, style
 from lfm_ppl.results.predictions import INTERVAL, PERIODS, SHOWN_PERIODS, quantiles, repeats_often
 from lfm_ppl.results.scalars import unit_of
+from lfm_ppl.results.series import select_series, series_dimension, series_labels
 from lfm_ppl.utils.checks import unknown
 
 MAX_PANELS = 12
@@ -30,7 +32,8 @@ _FORCE, _DETERMINISTIC = "#9AD3C1", "#F3CFA3"
 
 
 @style.styled
-def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
+def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any = None,
+             width: str | float = "column") -> Figure:
     """Draw the data of each output with the posterior of what was measured, and forecasts of it.
 
     The inner band holds 95% of the noise-free output, the outer one 95% of new measurements. Where the
@@ -48,10 +51,12 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, width: str | 
             forecasts, which alone are drawn of a result without trajectories, such as a partial one, held_out_data that
             these were compared with, and truth where it is known.
         outputs: names; None for all, up to 12.
+        series: labels or positions of series of a panel; None for all, up to a dozen.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
     Returns:
-        A figure with one panel per output. Ticks at the top of a panel mark the times of missing values.
+        A figure with one panel per output, and for each series of a panel. Ticks at the top mark the times of missing
+        values.
 
     Raises:
         ValueError: a group is missing, or an output is unknown.
@@ -68,32 +73,34 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, width: str | 
         >>> figure.axes[0].get_ylabel()
         'mRNA (nM)'
     """
-    result, remark = forecasts.recent_part(result)
-    observed = group(result, "observed_data")["y"].transpose("time", "output")
+    observed = group(result, "observed_data")["y"]
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
-    figure, panels = style.small_multiples(width, len(names), 1.35)
-    for axes, name in zip(panels, names, strict=True):
-        _draw_output(axes, result, name)
-        forecasts.mark_last_observation(axes, result)
-        _draw_truth(axes, result, "output", name)
-        _draw_data(axes, observed.sel(output=name))
-        forecasts.draw_held_out(axes, result, name)
-        style.label_values(axes, name, unit_of(observed, name))
+    parts, remark = recent_series(result, series, len(names))
+    figure, panels = style.small_multiples(width, len(parts) * len(names), 1.35)
+    for axes, (name, (title, part)) in zip(panels, itertools.product(names, parts.items()), strict=True):
+        _draw_output(axes, part, name)
+        forecasts.mark_last_observation(axes, part)
+        _draw_truth(axes, part, "output", name)
+        _draw_data(axes, group(part, "observed_data")["y"].sel(output=name))
+        forecasts.draw_held_out(axes, part, name)
+        style.label_values(axes, name, unit_of(observed, name), title)
     _finish(figure, panels, result, f"{remark} {note}")
     return figure
 
 
 @style.styled
-def plot_forces(result: Any, forces: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
+def plot_forces(result: Any, forces: Sequence[str] | None = None, *, series: Any = None,
+                width: str | float = "column") -> Figure:
     """Draw the posterior mean of each force with a 95% band, the forecast of it, and the truth where they are known.
 
     Args:
         result: with the group trajectories, predictions of a forecast, and truth where it is known.
         forces: names; None for all, up to 12.
+        series: labels or positions of series of a panel; None for all, up to a dozen.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
     Returns:
-        A figure with one panel per force.
+        A figure with one panel per force, and for each series of a panel.
 
     Raises:
         ValueError: the result holds no force trajectories, or a force is unknown.
@@ -107,20 +114,22 @@ def plot_forces(result: Any, forces: Sequence[str] | None = None, *, width: str 
         >>> [axes.get_ylabel() for axes in figure.axes]
         ['p53']
     """
-    return _draw_kind(result, "force", forces, width, (style.GREEN, _FORCE))
+    return _draw_kind(result, "force", forces, series, width, (style.GREEN, _FORCE))
 
 
 @style.styled
-def plot_states(result: Any, states: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
+def plot_states(result: Any, states: Sequence[str] | None = None, *, series: Any = None,
+                width: str | float = "column") -> Figure:
     """Draw the posterior mean of each state with a 95% band, the forecast of it, and the truth where they are known.
 
     Args:
         result: with the group trajectories, predictions of a forecast, and truth where it is known.
         states: names; None for all, up to 12.
+        series: labels or positions of series of a panel; None for all, up to a dozen.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
     Returns:
-        A figure with one panel per state.
+        A figure with one panel per state, and for each series of a panel.
 
     Raises:
         ValueError: the result holds no state trajectories, or a state is unknown.
@@ -133,20 +142,22 @@ def plot_states(result: Any, states: Sequence[str] | None = None, *, width: str 
         >>> [axes.get_ylabel() for axes in plot_states(build({"trajectories": draws})).axes]
         ['x', 'v']
     """
-    return _draw_kind(result, "state", states, width, (style.BLUE, forecasts.NOISE_FREE))
+    return _draw_kind(result, "state", states, series, width, (style.BLUE, forecasts.NOISE_FREE))
 
 
 @style.styled
-def plot_deterministics(result: Any, names: Sequence[str] | None = None, *, width: str | float = "column") -> Figure:
+def plot_deterministics(result: Any, names: Sequence[str] | None = None, *, series: Any = None,
+                        width: str | float = "column") -> Figure:
     """Draw the posterior mean of the deterministics with a 95% band, its forecast, and its truth.
 
     Args:
         result: with the group trajectories, of a model with ``deterministics``, predictions, and truth where known.
         names: of the deterministics; None for all, up to 12.
+        series: labels or positions of series of a panel; None for all, up to a dozen.
         width: "column" (3.4 in), "full" (7 in), or inches.
 
     Returns:
-        A figure with one panel for each.
+        A figure with one panel for each, and for each series of a panel.
 
     Raises:
         ValueError: the result holds none, or a name is unknown.
@@ -159,7 +170,7 @@ def plot_deterministics(result: Any, names: Sequence[str] | None = None, *, widt
         >>> [axes.get_ylabel() for axes in plot_deterministics(build({"trajectories": draws})).axes]
         ['uptake']
     """
-    return _draw_kind(result, "deterministic", names, width, (style.ORANGE, _DETERMINISTIC))
+    return _draw_kind(result, "deterministic", names, series, width, (style.ORANGE, _DETERMINISTIC))
 
 
 def trajectory_names(result: Any, kind: str) -> list[str]:
@@ -183,18 +194,50 @@ def pick(variable: xr.DataArray, kind: str, selection: Sequence[str] | None) -> 
     return selection
 
 
-def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, width: str | float,
+def series_views(result: Any, series: Any, count: int) -> tuple[dict[str, Any], str]:
+    """Return the series of a panel to draw, and a remark where some are left out.
+
+    Args:
+        result: of a panel, or of one series.
+        series: labels or positions; None for all, as many as have room.
+        count: number of axes of each series.
+
+    Returns:
+        Title -> result of one series; without a title where ``result`` is of one.
+    """
+    if series_dimension(result) is None:
+        if series is not None:
+            raise ValueError("series selects series of a panel, and the result is of one series; leave it out.")
+        return {"": result}, ""
+    labels = series_labels(result) if series is None else [series] if np.ndim(series) == 0 else list(series)
+    labels, note = style.first_of(labels, series, max(1, MAX_PANELS // count), "series")
+    views = [select_series(result, label) for label in labels]
+    return {view.attrs["selected"]: view for view in views}, note
+
+
+def recent_series(result: Any, series: Any, count: int) -> tuple[dict[str, Any], str]:
+    """Return `series_views` within the window of a forecast, and a remark."""
+    views, note = series_views(result, series, count)
+    parts = {title: forecasts.recent_part(view) for title, view in views.items()}
+    remarks = {remark for _, remark in parts.values() if remark}
+    if len(remarks) > 1:
+        remarks = {"The last rows of data and the forecast."}
+    return {title: part for title, (part, _) in parts.items()}, " ".join([*remarks, note])
+
+
+def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, series: Any, width: str | float,
                colours: tuple[str, str]) -> Figure:
     """Draw a panel for each force, state or deterministic, its mean and band in the two ``colours``."""
-    result, remark = forecasts.recent_part(result)
     draws = _trajectories(result, kind)
     names, note = style.first_of(pick(draws, kind, selection), selection, MAX_PANELS, f"{kind}s")
-    predicted = forecasts.series_predictions(result)
-    paths = None if predicted is None else predicted.get(f"{kind}s")
-    windows = _season_windows(draws, forecasts.forecast_span(result)[1])
-    figure, panels = style.small_multiples(width, len(names), 1.25, sharex=not set(windows) & set(names))
-    for axes, name in zip(panels, names, strict=True):
-        band = np.array(_band(result, kind, name))
+    parts, remark = recent_series(result, series, len(names))
+    windows = {name: window for part in parts.values() for name, window in _season_windows(
+        _trajectories(part, kind), forecasts.forecast_span(part)[1]).items()}
+    figure, panels = style.small_multiples(width, len(parts) * len(names), 1.25, not set(windows) & set(names))
+    for axes, (name, (title, part)) in zip(panels, itertools.product(names, parts.items()), strict=True):
+        predicted = forecasts.series_predictions(part)
+        paths = None if predicted is None else predicted.get(f"{kind}s")
+        band = np.array(_band(part, kind, name))
         first, last = windows.get(name, (-np.inf, np.inf))
         time, mean, low, high = band[:, band[0] >= first]
         axes.plot(time, mean, color=colours[0], zorder=2, label="posterior mean")
@@ -202,9 +245,9 @@ def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, width: s
         if paths is not None:
             later = paths.sel({kind: name, "time": (paths["time"] > time[-1]) & (paths["time"] <= last)})
             forecasts.draw_paths(axes, later, (time[-1], mean[-1], low[-1], high[-1]), *colours)
-            forecasts.mark_last_observation(axes, result)
-        _draw_truth(axes, result, kind, name)
-        style.label_values(axes, name, unit_of(draws, name))
+            forecasts.mark_last_observation(axes, part)
+        _draw_truth(axes, part, kind, name)
+        style.label_values(axes, name, unit_of(draws, name), title)
     shortened = [name for name in names if name in windows]
     periods = f"Of {', '.join(shortened)} {SHOWN_PERIODS} periods at the end of the data." if shortened else ""
     _finish(figure, panels, result, f"{remark} {periods} {note}")
@@ -235,7 +278,7 @@ def _trajectories(result: Any, kind: str) -> xr.DataArray:
             f"{', '.join(map(str, dataset.data_vars))}. They come from lfm.fit with "
             f"trajectory_draws above zero, for a model that has {kind}s."
         )
-    return dataset[f"{kind}s"].transpose("chain", "draw", "at", kind)
+    return dataset[f"{kind}s"].transpose("chain", "draw", ..., "at", kind)
 
 
 def _draw_truth(axes: Axes, result: Any, kind: str, name: str) -> None:
@@ -320,7 +363,7 @@ def _band(result: Any, kind: str, name: str) -> tuple[np.ndarray, np.ndarray, np
 def _summary(result: Any, name: str) -> xr.DataArray | None:
     """Return the summary (statistic, at, ...) of trajectories; None where there are draws alone."""
     summary = group(result, "trajectories").get(f"{name}_summary")
-    return None if summary is None or "series" in summary.dims else summary.transpose("statistic", "at", ...)
+    return None if summary is None else summary.transpose("statistic", "at", ...)
 
 
 def _draw_data(axes: Axes, data: xr.DataArray) -> None:

@@ -1,0 +1,151 @@
+"""The series of a panel in a result: the name of their dimension, their labels, and one of them alone.
+
+1. The dimension of the series has the name of the plate, and is a dimension of ``observed_data``.
+2. Where series have times of their own, the coordinate ``times`` of a group holds them, one row for each series.
+3. `select_series` takes one entry of that dimension in every group, and drops the rows that pad the series.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from lfm_ppl.results import arviz_data
+from lfm_ppl.utils import checks
+
+if TYPE_CHECKING:  # figures need no JAX
+    from lfm_ppl.inference.bound_model import BoundModel
+
+SERIES = "series"
+"""Dimension of the series where a plate has no usable name; a second name of it in ``coords`` of `lfm_ppl.fit`."""
+
+TIMES = "times"
+"""Coordinate (series, time) or (series, at) of series that have times of their own."""
+
+_OTHER_DIMENSIONS = ("chain", "draw", "time", "at", "at_truth", "output", "state", "force", "deterministic",
+                     "statistic", "parameter")
+"""Dimensions of a result that a plate cannot give its name to."""
+
+_NOT_OF_SERIES = ("accuracy",)
+"""Groups about the panel as a whole."""
+
+
+def plate_dimension(bound: BoundModel) -> str | None:
+    """Return the name of a panel's plate, which is the dimension of its series; None for one series."""
+    if np.ndim(bound.y) != 3:
+        return None
+    plates = [frame.name for frame in bound.trace()[bound.site.name].get("cond_indep_stack", ())]
+    return plates[0] if len(plates) == 1 and plates[0] not in _OTHER_DIMENSIONS else SERIES
+
+
+def series_dimension(result: Any) -> str | None:
+    """Return the dimension of the series of a result; None where it is of one series."""
+    if not arviz_data.has_group(result, "observed_data"):
+        return None
+    dims = arviz_data.group(result, "observed_data").dims
+    return next((str(name) for name in dims if name not in _OTHER_DIMENSIONS), None)
+
+
+def series_labels(result: Any) -> list[Any]:
+    """Return the labels of the series of a panel, or their positions where a result has none."""
+    return arviz_data.group(result, "observed_data")[series_dimension(result)].values.tolist()
+
+
+def times_of(dataset: xr.Dataset, clock: str = "time") -> xr.DataArray:
+    """Return the times along the dimension ``clock`` of a group, (K,), or (B, K) where series have their own."""
+    return dataset[TIMES] if TIMES in dataset.variables else dataset[clock]
+
+
+def select_series(result: Any, series: Any) -> Any:
+    """Return one series of a panel as a result of one series, for figures, tables and the report.
+
+    Rows that pad the series, all missing at the time of the row before, are left out, and so is the accuracy report,
+    which is about the panel. Parameters that series share stay as they are.
+
+    Args:
+        result: of a panel.
+        series: label of the series, or its position where no label equals it.
+
+    Returns:
+        An ArviZ object with the names and dimensions of a result of one series. Its attribute ``selected``
+        names the series. `lfm_ppl.forecast` and `lfm_ppl.check_accuracy` take the panel instead, whose model it is.
+
+    Raises:
+        ValueError: the result is of one series, or has no such series.
+
+    Example:
+        >>> y = xr.Dataset({"y": (("patient", "time", "output"), np.arange(4.0).reshape(2, 2, 1))})
+        >>> y = y.assign_coords(patient=["Ann", "Bo"], time=[0.0, 1.0], output=["dose"])
+        >>> draws = xr.Dataset({"rate": (("chain", "draw", "patient"), np.ones((1, 5, 2)))})
+        >>> panel = arviz_data.build({"posterior": draws.assign_coords(patient=["Ann", "Bo"]), "observed_data": y})
+        >>> one = select_series(panel, "Bo")
+        >>> one["observed_data"]["y"].values.ravel().tolist(), one["posterior"]["rate"].dims
+        ([2.0, 3.0], ('chain', 'draw'))
+    """
+    dimension = series_dimension(result)
+    if dimension is None:
+        raise ValueError("the result is of one series, so that there is none to select; take the result.")
+    labels = series_labels(result)
+    index = _position(labels, series)
+    observed = arviz_data.group(result, "observed_data")
+    name = next(label for label in observed.data_vars if dimension in observed[label].dims and label != TIMES)
+    is_observed = observed[name].notnull().any("output").transpose(dimension, "time").values
+    has_scores = is_observed[index][is_observed.any(axis=0)]
+    is_later = np.diff(_select(observed, dimension, index)["time"].values, prepend=-np.inf) > 0
+    groups = {}
+    for label in arviz_data.groups(result):
+        if label in _NOT_OF_SERIES:
+            continue
+        dataset = _select(arviz_data.group(result, label), dimension, index)
+        if label == "log_likelihood":
+            dataset = dataset.isel(time=has_scores)
+        elif label in ("observed_data", "one_step_ahead", "posterior_predictive"):
+            dataset = dataset.isel(time=is_observed[index] | is_later)
+        groups[label] = dataset
+    times = groups["observed_data"]["time"].values[groups["observed_data"][name].notnull().any("output").values]
+    if "predictions" in groups:
+        groups["predictions"].attrs["last_observation"] = float(np.max(times, initial=-np.inf))
+    attrs = _select_mode(arviz_data.attributes(result), arviz_data.group(result, "posterior"), dimension, index)
+    return arviz_data.build(groups, attrs | {"selected": f"{dimension} {labels[index]}"})
+
+
+def _position(labels: list[Any], series: Any) -> int:
+    for index, label in enumerate(labels):
+        if str(series) == str(label):
+            return index
+    if isinstance(series, (int, np.integer)) and -len(labels) <= series < len(labels):
+        return int(series) % len(labels)
+    raise ValueError(checks.unknown("series", str(series), list(map(str, labels))))
+
+
+def _select(dataset: xr.Dataset, dimension: str, index: int) -> xr.Dataset:
+    """Return a group of one series, whose own times become the coordinate of the group."""
+    if dimension in dataset.dims:
+        dataset = dataset.isel({dimension: index}, drop=True)
+    if TIMES not in dataset.variables:
+        return dataset
+    clock, times = "at" if "at" in dataset.dims else "time", dataset[TIMES]
+    dataset = dataset.drop_vars(TIMES).assign_coords({clock: (clock, times.values, times.attrs)})
+    # The times of trajectories are padded by the last one.
+    return dataset.isel(at=np.diff(times.values, prepend=-np.inf) > 0) if clock == "at" else dataset
+
+
+def _select_mode(attrs: Mapping[str, Any], posterior: xr.Dataset, dimension: str, index: int) -> dict[str, Any]:
+    """Return the attributes with the mode of one series, and its degenerate parameters."""
+    modes = json.loads(attrs.get(arviz_data.MODE, "{}"))
+    degenerate = json.loads(attrs.get(arviz_data.DEGENERATE, "{}"))
+    for name, value in modes.items():
+        variable = posterior.get(name.replace("/", "."))
+        if variable is None or dimension not in variable.dims:
+            continue
+        axis = variable.dims.index(dimension) - 2
+        modes[name] = np.take(value, index, axis).tolist()
+        if name in degenerate:
+            is_degenerate = np.isin(np.arange(np.size(value)), degenerate[name]).reshape(np.shape(value))
+            degenerate[name] = np.flatnonzero(np.take(is_degenerate, index, axis)).tolist()
+    changed = {arviz_data.MODE: modes, arviz_data.DEGENERATE: degenerate}
+    return {**attrs, **{name: json.dumps(value) for name, value in changed.items() if name in attrs}}
