@@ -12,7 +12,7 @@ from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
 
-_SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance")
+_SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance", "method")
 
 
 def approximated_model(options: FitArguments, model: loading.ModelFile) -> Any:

@@ -231,6 +231,8 @@ class Approximation:
     """longest integration step"""
     tolerance: Annotated[Positive, Parameter(metavar="SD")] | None = None
     """adaptive steps: largest error of an integration step, in standard deviations; excludes --iterations"""
+    method: Annotated[str, Parameter(choices=("runge-kutta", "exponential"), metavar="METHOD")] | None = None
+    """method of integration: explicit, or exponential steps for stiff dynamics"""
     iterations: CountOrZero | None = None
     """iterations of posterior linearisation; 0: a single pass"""
     lower: Pairs = ()

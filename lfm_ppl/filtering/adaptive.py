@@ -2,7 +2,8 @@
 
 1. Where the fifth stage, which is the next step's first, replaces the fourth, Runge-Kutta's formula has order three.
    The difference of the two results, e = h (k_4 - k_5) / 6, estimates the error of a step at no cost, in the mean and
-   in the covariance, in standard deviations.
+   in the covariance, in standard deviations. An exponential step predicts its end with order two as well; the estimate
+   is the difference of the two predictions.
 2. A step with an error above the tolerance is repeated with a shorter length.
 3. The next length is that at which the error would be a little below the tolerance.
 4. Attempts run in blocks; `jax.lax.cond` skips attempts and blocks after the end of the interval.
@@ -21,6 +22,8 @@ import jax
 import jax.numpy as jnp
 
 from lfm_ppl.filtering.dynamics import DriftLinearization, Dynamics, covariance_of, linearize_drift, minimum_sd
+from lfm_ppl.filtering.exponential import exponential_step
+from lfm_ppl.filtering.intervals import EXPONENTIAL
 from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose
 from lfm_ppl.filtering.predict import identity_prediction
 from lfm_ppl.filtering.runge_kutta import FourthStage, runge_kutta_step
@@ -69,7 +72,7 @@ class _Position(NamedTuple):
 
 def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float, span: Span, length: jax.Array,
                                 moments: Moments, record: Record = Record.LIKELIHOOD) -> Prediction:
-    """Predict over an interval in Runge-Kutta steps whose errors are below a tolerance.
+    """Predict over an interval in steps whose errors are below a tolerance.
 
     Args:
         dynamics: the model and the rule.
@@ -83,21 +86,31 @@ def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float
     ssm, has_map, stop = dynamics.ssm, record is Record.SMOOTHER, jax.lax.stop_gradient
     min_sd = minimum_sd(dynamics, integrating_factor(ssm, dynamics.linear, length), span.time(), length, moments)
 
+    is_exponential = dynamics.method == EXPONENTIAL
+
     def linearize_at(t: jax.Array, moments: Moments) -> DriftLinearization:
         return linearize_drift(dynamics, t, moments.mean, covariance_of(moments), min_sd)
 
     def attempt(position: _Position) -> _Position:
-        # Where this is shorter, a rejected step stays finite, and so does its derivative, which is not used.
-        trial = stop(jnp.minimum(position.trial, _STABILITY_LIMIT / _fastest_rate(position.stage.jacobian)))
+        trial = position.trial
+        if not is_exponential:
+            # Where this is shorter, a rejected step stays finite, and so does its derivative, which is not used.
+            trial = stop(jnp.minimum(trial, _STABILITY_LIMIT / _fastest_rate(position.stage.jacobian)))
         is_last = trial >= position.remaining
         h = jnp.where(is_last, position.remaining, trial)
         rest_of_span = span.shifted(length - position.remaining)
-        factor = integrating_factor(ssm, dynamics.linear, h)
         previous = position.prediction
-        step, stage4 = runge_kutta_step(dynamics, factor, rest_of_span, h, previous.moments, min_sd,
-                                        stage1=position.stage)
-        stage5 = linearize_at(rest_of_span.time(h), step.moments)
-        error = stop(_error(h, previous.moments, step.moments, stage4, stage5)) / tolerance
+        if is_exponential:
+            step, coarse = exponential_step(dynamics, rest_of_span, h, previous.moments, min_sd)
+            stage5 = position.stage
+            mean_error, covariance_error = jax.tree.map(jnp.subtract, step.moments, coarse)
+        else:
+            factor = integrating_factor(ssm, dynamics.linear, h)
+            step, stage4 = runge_kutta_step(dynamics, factor, rest_of_span, h, previous.moments, min_sd,
+                                            stage1=position.stage)
+            stage5 = linearize_at(rest_of_span.time(h), step.moments)
+            mean_error, covariance_error = _runge_kutta_error(h, step.moments, stage4, stage5)
+        error = stop(_in_standard_deviations(mean_error, covariance_error, previous.moments, step.moments)) / tolerance
         # A step that is not finite is far too long, and is repeated.
         error = jnp.where(jnp.isfinite(error), error, jnp.inf)
         growth = jnp.clip(_SAFETY * jnp.maximum(error, 1e-12) ** -0.25, _MIN_GROWTH, _MAX_GROWTH)
@@ -143,15 +156,21 @@ def _fastest_rate(jacobian: jax.Array) -> jax.Array:
     return largest * jnp.maximum(jnp.max(jnp.abs(power), initial=0.0), 1e-100) ** 0.125
 
 
-def _error(h: jax.Array, start: Moments, end: Moments, stage4: FourthStage, stage5: DriftLinearization) -> jax.Array:
-    """Return the largest estimated error of the mean and the covariance of a step, in standard deviations."""
+def _runge_kutta_error(h: jax.Array, end: Moments, stage4: FourthStage,
+                       stage5: DriftLinearization) -> tuple[jax.Array, jax.Array]:
+    """Return the estimated errors of the mean (M,) and of the rows (M, n) of the covariance at the end of a step."""
     size = stage5.remainder.shape[0]
+    mean = stage4.drift.remainder - stage5.remainder
+    covariance = matmul(stage4.drift.jacobian, stage4.covariance) - matmul(stage5.jacobian, end.covariance)
+    covariance = covariance.at[:, :size].add(covariance[:, :size].T)
+    if stage5.diffusion is not None and stage4.drift.diffusion is not None:
+        covariance = covariance.at[:, :size].add(stage4.drift.diffusion - stage5.diffusion)
+    return h / 6 * mean, h / 6 * covariance
+
+
+def _in_standard_deviations(mean: jax.Array, covariance: jax.Array, start: Moments, end: Moments) -> jax.Array:
+    """Return the largest error of the mean (k,) and the covariance (k, n) of the first k states in a step."""
     variance = jnp.maximum(jnp.diagonal(start.covariance), jnp.diagonal(end.covariance))
     sd = jnp.sqrt(jnp.maximum(variance, (_MEAN_FRACTION * end.mean) ** 2) + 1e-300)
-    mean = (stage4.drift.remainder - stage5.remainder) / sd[:size]
-    change = matmul(stage4.drift.jacobian, stage4.covariance) - matmul(stage5.jacobian, end.covariance)
-    change = change.at[:, :size].add(change[:, :size].T)
-    if stage5.diffusion is not None and stage4.drift.diffusion is not None:
-        change = change.at[:, :size].add(stage4.drift.diffusion - stage5.diffusion)
-    covariance = change / (sd[:size, None] * sd[None, :])
-    return h / 6 * jnp.maximum(jnp.max(jnp.abs(mean)), jnp.max(jnp.abs(covariance)))
+    rows = sd[:mean.shape[0]]
+    return jnp.maximum(jnp.max(jnp.abs(mean) / rows), jnp.max(jnp.abs(covariance) / (rows[:, None] * sd[None, :])))

@@ -21,9 +21,9 @@ from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.ep.terms import FamilyTerms, row_log_prob
 from lfm_ppl.filtering.forward import FilterTrace, forward
-from lfm_ppl.filtering.intervals import Intervals, TimeGrid, intervals_between
+from lfm_ppl.filtering.intervals import RUNGE_KUTTA, Intervals, TimeGrid, intervals_between
 from lfm_ppl.filtering.moments import Moments, Record
-from lfm_ppl.filtering.problem import filter_problem
+from lfm_ppl.filtering.problem import filter_problem, has_exact_transitions
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -113,10 +113,11 @@ def _explain_row(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array,
     row = int(np.argmin(is_good))
     interval = jax.tree_util.tree_map(lambda a: np.asarray(a)[grid.observed[row]], grid.intervals)
     where = f"at row {row} (time {float(interval.start + interval.length):.6g})"
+    remedy = 'try more steps (steps=...), for stiff dynamics method="exponential", or a tighter prior'
     if not np.isfinite(at_data.predicted.mean[row]).all():
-        return f"the predicted mean of the state is not finite {where}: try more steps (steps=...) or a tighter prior"
+        return f"the predicted mean of the state is not finite {where}: {remedy}"
     if not np.isfinite(at_data.predicted.covariance[row]).all():
-        return f"the predicted covariance is not finite {where}: try more steps (steps=...) or a tighter prior"
+        return f"the predicted covariance is not finite {where}: {remedy}"
     predictor, names = at_data.predictor[row], ssm.model.output_names
     if not np.isfinite(predictor).all():
         output = int(np.argmin(np.isfinite(predictor)))
@@ -154,7 +155,7 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
         return None
     rows = jax.tree.map(np.asarray, grid.intervals)
     previous = start if row == 0 else Moments(trace.filtered.mean[row - 1], trace.filtered.covariance[row - 1])
-    count = 1 if ssm.time_invariant or grid.tolerance is not None else grid.steps
+    count = 1 if has_exact_transitions(ssm, grid) or grid.tolerance is not None else grid.steps
     interval: Intervals = jax.tree.map(lambda column: column[row:row + 1], rows)
     stepwise = _run_filter(ssm, rule, _divide_interval(grid, interval, count), y, previous)
     step = _first_bad_row(stepwise)
@@ -168,10 +169,11 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
     where = f"row {later[0]} (time {time:.6g})" if later.size else f"time {time:.6g}, after the last observation"
     if count > 1 and step is not None:
         where += f", step {step + 1} of {count} from time {interval.start[0]:.6g} to {interval.end[0]:.6g}"
+    stiff = 'method="exponential" for stiff dynamics, ' if grid.method == RUNGE_KUTTA else ""
     remedy = ("Try a tighter prior, an observation noise that is not so small, or other units" if ssm.time_invariant
-              else "Try more steps (up to five times their number are tried), a larger tolerance, another rule, or a "
-              "tighter prior" if grid.tolerance is not None
-              else "Try more steps (steps=...), a longest step (max_step=...), steps that follow a tolerance "
+              else f"Try {stiff}more steps (up to five times steps={grid.steps} are tried), a larger tolerance, "
+              "another rule, or a tighter prior" if grid.tolerance is not None
+              else f"Try {stiff}more steps (steps=...), a longest step (max_step=...), steps that follow a tolerance "
               "(tolerance=1e-3), another rule, or a tighter prior")
     return f"the filter breaks down at {where}: {reason}. The log likelihood is -inf. {remedy}."
 

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
+from lfm_ppl.filtering.intervals import RUNGE_KUTTA
 from lfm_ppl.filtering.moments import Moments, matvec
 from lfm_ppl.filtering.transition import IntegratingFactor, LinearPart
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, selection
@@ -34,11 +35,12 @@ Congruence = Callable[[jax.Array, bool], jax.Array]
 
 
 class Dynamics(NamedTuple):
-    """A model, a linearisation rule, and the constant linear part of the model's dynamics."""
+    """A model, a linearisation rule, the constant linear part of the dynamics, and the method of integration."""
 
     ssm: StateSpaceModel
     rule: Rule
     linear: LinearPart
+    method: str = RUNGE_KUTTA
 
 
 class DriftLinearization(NamedTuple):
@@ -127,7 +129,7 @@ def linearize_drift(dynamics: Dynamics, t: jax.Array, mean: jax.Array, covarianc
         min_sd: see `minimum_sd`.
         about: moments to linearise about; None: the filter's moments.
     """
-    ssm, rule, linear = dynamics
+    ssm, rule, linear, _ = dynamics
 
     def function(w: jax.Array) -> tuple[jax.Array, Any]:
         dispersion = ssm.dispersion(w, t)

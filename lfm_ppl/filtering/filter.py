@@ -22,7 +22,7 @@ from lfm_ppl.filtering.arguments import as_rule, check_observations, warn_single
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter, quantile_residuals
 from lfm_ppl.filtering.forward import FilterTrace, forward
-from lfm_ppl.filtering.intervals import TimeGrid
+from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import at_intervals, filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -69,7 +69,7 @@ class FilterResult(eqx.Module):
 
 def filter(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule | None = None, steps: int = 10,
            max_step: float | None = None, start: FilterState | None = None,
-           tolerance: float | None = None) -> FilterResult:
+           tolerance: float | None = None, method: str = RUNGE_KUTTA) -> FilterResult:
     """Run the continuous-discrete Gaussian filter.
 
     Between observations the moments obey dm/dt = E[f], dP/dt = A P + P A' + E[G G'] with the rule's A; at an
@@ -88,6 +88,7 @@ def filter(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
             missing (a prediction). Results equal a single pass over all times, and calls with equally many new times
             share one compilation. An observation covariance for each time has the entries of the new times.
         tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
+        method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
 
     Returns:
         Log likelihoods, moments and residuals, by observation.
@@ -110,11 +111,12 @@ def filter(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     Source: Särkkä and Sarmavuori (2013), Signal Processing 93; Hartikainen et al. (2012), section 4.
     """
     rule = as_rule(rule)
+    checks.one_of("method", method, METHODS)
     ssm = state_space(model)
     if start is not None:
         _check_start(start, times, ssm.state_dim)
     grid = build_time_grid(ssm, times, steps, max_step, initial_time=None if start is None else start.time,
-                           tolerance=tolerance)
+                           tolerance=tolerance)._replace(method=method)
     model.check_at(grid.initial_time, len(grid.observed))
     check_resolution(model, times, y)
     y = check_observations(y, len(grid.observed), ssm.output_dim, start is not None, model)

@@ -35,7 +35,7 @@ from lfm_ppl.filtering.predict import (
     predict_exact,
     predict_interval,
 )
-from lfm_ppl.filtering.problem import FilterProblem
+from lfm_ppl.filtering.problem import FilterProblem, has_exact_transitions
 from lfm_ppl.filtering.update import (
     INNOVATION_FACTOR,
     UPDATE_FAILED,
@@ -182,7 +182,8 @@ def predict(problem: FilterProblem, interval: Intervals, moments: Moments, about
     """
     ssm, _, grid, shared = problem
     dynamics, transition = problem.dynamics, shared.transition(interval)
-    has_nodes = record is Record.LINEARIZATION and grid.tolerance is None and not ssm.time_invariant
+    is_exact = has_exact_transitions(ssm, grid)
+    has_nodes = record is Record.LINEARIZATION and grid.tolerance is None and not is_exact
     if record is Record.LINEARIZATION and not has_nodes:
         record = Record.SMOOTHER
 
@@ -199,13 +200,13 @@ def predict(problem: FilterProblem, interval: Intervals, moments: Moments, about
     def collect(prediction: Prediction) -> Prediction:
         return _collect_nodes(problem, interval, prediction) if has_nodes else prediction
 
-    if ssm.time_invariant:
+    if is_exact:
         prediction = predict_exact(ssm, transition, grid.steps, interval.span, interval.length, moments)
     elif grid.replicated:
         prediction = jax.lax.cond(interval.length > 0, integrate, keep_moments)
     else:
         prediction = integrate()
-    has_map = record is Record.SMOOTHER or ssm.time_invariant
+    has_map = record is Record.SMOOTHER or is_exact
     if shared.jumps is not None:
         prediction = apply_jump(prediction, jump_map(ssm, shared.jumps, interval.jump), has_map)
     return prediction if interval.state_map is None else apply_event(prediction, interval.state_map, has_map)
@@ -237,7 +238,7 @@ def maps_about(problem: FilterProblem, points: LinearizationPoints | None) -> In
     the moments for them. A linear model is linearised about no points.
     """
     ssm, rule, grid, _ = problem
-    if ssm.time_invariant or grid.tolerance is not None:
+    if has_exact_transitions(ssm, grid) or grid.tolerance is not None:
         return None
 
     def interval_map(inputs: tuple[Intervals, Moments | None]) -> IntervalMaps:

@@ -12,6 +12,9 @@ import numpy as np
 
 from lfm_ppl.model.state_space import Span, StateSpaceModel, inset
 
+RUNGE_KUTTA, EXPONENTIAL = METHODS = "runge-kutta", "exponential"
+"""Methods of integration: explicit, and A-stable for stiff dynamics."""
+
 
 class Intervals(NamedTuple):
     """The intervals of the scan, one entry each: a prediction, perhaps a jump, perhaps an observation.
@@ -65,6 +68,7 @@ class TimeGrid(NamedTuple):
         initial_time: start of the scan.
         replicated: whether intervals of length zero are so many that a branch around their prediction is faster.
         tolerance: of the error of an adaptive step, in standard deviations; None for ``steps`` equal steps.
+        method: of integration, one of `METHODS`.
         since: (N,) starts of the intervals, counted from the initial time, so that small differences of large times
             keep all their digits.
     """
@@ -78,6 +82,7 @@ class TimeGrid(NamedTuple):
     initial_time: Any
     replicated: bool = False
     tolerance: float | None = None
+    method: str = RUNGE_KUTTA
     since: Any = None
 
 

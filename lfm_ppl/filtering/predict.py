@@ -2,7 +2,8 @@
 
 1. A linear time-invariant model has an exact transition, tabulated by interval length.
 2. Any other model takes equal steps: Simpson's rule if only the forces enter non-linearly (`simpson`), else the
-   covariance-preserving Runge-Kutta method (`runge_kutta`); or steps that follow a tolerance (`adaptive`).
+   covariance-preserving Runge-Kutta method (`runge_kutta`); exponential steps (`exponential`) where these are chosen;
+   or steps that follow a tolerance (`adaptive`).
 3. About given linearisation points the prediction is an affine map, which is stored or composed.
 4. A jump of a force, or an event, at the end of the interval is one more affine map.
 """
@@ -21,6 +22,8 @@ from lfm_ppl.filtering.dynamics import (
     linearization_indices,
     minimum_sd,
 )
+from lfm_ppl.filtering.exponential import exponential_step
+from lfm_ppl.filtering.intervals import EXPONENTIAL
 from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose, matvec, transform
 from lfm_ppl.filtering.runge_kutta import runge_kutta_step
 from lfm_ppl.filtering.simpson import apply_step_map, insert_midpoints, step_maps
@@ -115,20 +118,25 @@ def predict_interval(dynamics: Dynamics, factor: IntegratingFactor, steps: int, 
             phi, process_cov = compose((phi, process_cov), (step.phi, step.process_cov))
         return Prediction(step.moments, phi, process_cov), _step_record(dynamics, step, record)
 
-    if is_nonlinear_in_forces_only(dynamics.ssm, dynamics.rule):
+    is_exponential = dynamics.method == EXPONENTIAL
+    if is_nonlinear_in_forces_only(dynamics.ssm, dynamics.rule) and not is_exponential:
         maps = step_maps(dynamics, factor, steps, span, h, moments, min_sd, about)
         last, nodes = jax.lax.scan(
             lambda previous, step_map: advance(previous, apply_step_map(previous.moments, step_map, factor.full)),
             initial, maps)
         return last._replace(nodes=nodes)
 
-    def runge_kutta(previous: Prediction, inputs: tuple) -> tuple[Prediction, StepRecord | None]:
+    def integrate(previous: Prediction, inputs: tuple) -> tuple[Prediction, StepRecord | None]:
         index, points = inputs
-        step, _ = runge_kutta_step(dynamics, factor, span.shifted(index * h), h, previous.moments, min_sd, points)
+        rest_of_span = span.shifted(index * h)
+        if is_exponential:
+            step, _ = exponential_step(dynamics, rest_of_span, h, previous.moments, min_sd, points)
+        else:
+            step, _ = runge_kutta_step(dynamics, factor, rest_of_span, h, previous.moments, min_sd, points)
         return advance(previous, step)
 
     points = jax.tree.map(lambda nodes: _by_steps(insert_midpoints(nodes)), about)
-    last, nodes = jax.lax.scan(jax.checkpoint(runge_kutta, prevent_cse=False), initial, (jnp.arange(steps), points))
+    last, nodes = jax.lax.scan(jax.checkpoint(integrate, prevent_cse=False), initial, (jnp.arange(steps), points))
     return last._replace(nodes=nodes)
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.dynamics import Dynamics
-from lfm_ppl.filtering.intervals import Intervals, TimeGrid, by_length, with_state_maps
+from lfm_ppl.filtering.intervals import EXPONENTIAL, Intervals, TimeGrid, by_length, with_state_maps
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.predict import interval_factor
 from lfm_ppl.filtering.transition import LinearPart, constant_jacobian, exact, linear_part
@@ -62,11 +62,19 @@ class FilterProblem(NamedTuple):
     @property
     def dynamics(self) -> Dynamics:
         """Model, rule and linear part, as a prediction needs them."""
-        return Dynamics(self.ssm, self.rule, self.shared.linear)
+        return Dynamics(self.ssm, self.rule, self.shared.linear, self.grid.method)
 
     def initial(self, initial: Moments | None = None) -> Moments:
         """Return moments at the initial time, by default the model's."""
         return Moments(*self.ssm.initial()) if initial is None else initial
+
+
+def has_exact_transitions(ssm: StateSpaceModel, grid: TimeGrid) -> bool:
+    """Return whether the transitions of a model over intervals are exact, so that nothing but inputs is integrated.
+
+    Simpson's rule for known inputs is wrong for stiff dynamics, which then takes exponential steps.
+    """
+    return ssm.mean_invariant or (ssm.time_invariant and grid.method != EXPONENTIAL)
 
 
 def filter_problem(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> FilterProblem:
@@ -76,7 +84,7 @@ def filter_problem(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> FilterPr
     is_tabulated = grid.lengths is not None and len(grid.lengths) <= max(_FEW_LENGTHS, count // _INTERVALS_PER_LENGTH)
 
     def transition(length: jax.Array) -> Any:
-        if ssm.time_invariant:
+        if has_exact_transitions(ssm, grid):
             return exact(ssm, length, grid.steps, linear)
         if grid.tolerance is not None:
             return None

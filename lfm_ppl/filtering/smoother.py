@@ -27,7 +27,7 @@ from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.filter import whitened_innovations
 from lfm_ppl.filtering.forward import FilterTrace, forward
-from lfm_ppl.filtering.intervals import TimeGrid
+from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.iterated import IterationResult, posterior_linearisation
 from lfm_ppl.filtering.moments import Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
@@ -158,7 +158,8 @@ def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
 
 def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule | None = None, steps: int = 10,
            max_step: float | None = None, at: ArrayLike | None = None, iterations: int = 0, damping: float = 0.7,
-           tolerance: float | None = None, sites: SiteSettings | str | None = None) -> SmootherResult:
+           tolerance: float | None = None, sites: SiteSettings | str | None = None,
+           method: str = RUNGE_KUTTA) -> SmootherResult:
     """Smooth: the state and the forces given all observations.
 
         m_s = m + G (m_s+ - m_p),  P_s = (I - G Phi) P (I - G Phi)' + G (Q + P_s+) G',  G = P Phi' P_p^-1.
@@ -177,6 +178,7 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         iterations: of posterior linearisation, 0 for none.
         damping: largest fraction of each new iterate that is taken, in (0, 1]; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
+        method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
         sites: of an observation family, how its sites are refined: "ep" (the default), "variational", "laplace", or
             `lfm_ppl.SiteSettings`.
 
@@ -201,10 +203,11 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     de Jong (1989), Biometrika 76, for the leave-one-out conditionals.
     """
     rule = as_rule(rule)
+    checks.one_of("method", method, METHODS)
     check_iterations(iterations, damping, tolerance)
     settings = as_settings(sites, iterations)
     ssm = state_space(model)
-    grid = build_time_grid(ssm, times, steps, max_step, at, tolerance=tolerance)
+    grid = build_time_grid(ssm, times, steps, max_step, at, tolerance=tolerance)._replace(method=method)
     model.check_at(grid.initial_time, np.shape(times)[0])
     check_resolution(model, times, y)
     y = check_observations(y, len(grid.observed), ssm.output_dim, model=model)

@@ -24,6 +24,7 @@ from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.evidence import Evidence, evidence
 from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
+from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
@@ -65,13 +66,15 @@ class MarginalLikelihood(SeriesLikelihood):
             linear model, an observation family, constraints, or with a ``tolerance``.
         damping: largest share of each new iterate that is taken; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations. With it the length of the steps follows
-            the moments, for every parameter anew, for stiff models and for posteriors over slow and fast ones; up to
-            five times ``steps`` are tried. None: ``steps`` equal steps. Not with ``iterations``.
+            the moments, for every parameter anew, for posteriors over slow and fast models; up to five times ``steps``
+            are tried. None: ``steps`` equal steps. Not with ``iterations``.
         sites: of an observation family, how its sites are refined: "ep" (expectation propagation, the default),
             "variational", "laplace", or `lfm_ppl.SiteSettings`. The log density is then the log evidence of the
             converged sites. Where the model is not linear it is linearised about smoothed moments, ``iterations`` times
             (8 by default). Where sites do not converge, the log density of a model that is not linear is that of
             assumed density filtering, which is rougher, and -inf in a linear one.
+        method: of integration, "runge-kutta" (explicit), or "exponential" for stiff dynamics: its steps of order three
+            are stable however fast a state decays, and each costs some ten of the other. With a ``tolerance``, too.
         lower: name of a state, force or output -> its lower bound. Under constraints the log density is
             log Z(y, c) - log Z(c), that of the data given that the constraints are respected: by expectation
             propagation, made right with ``draws`` trajectories that respect them. It is -inf where that does not
@@ -106,7 +109,7 @@ class MarginalLikelihood(SeriesLikelihood):
     Source: Hartikainen et al. (2012), section 4; Singer (2011), AStA 95.
     """
 
-    pytree_aux_fields = ("max_step", "iterations", "damping", "tolerance", "sites")
+    pytree_aux_fields = ("max_step", "iterations", "damping", "tolerance", "method", "sites")
 
     def __new__(cls, model: Any = None, times: Any = None, rule: Rule | None = None, steps: int = 10,
                 *filter_settings: Any, lower: Any = None, upper: Any = None, constraints: Any = (), grid: Any = None,
@@ -122,6 +125,7 @@ class MarginalLikelihood(SeriesLikelihood):
     def __init__(self, model: LatentForceModel, times: ArrayLike, rule: Rule | None = None, steps: int = 10,
                  max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
                  tolerance: float | None = None, sites: SiteSettings | str | None = None, *,
+                 method: str = RUNGE_KUTTA,
                  lower: Mapping[str, ArrayLike] | None = None, upper: Mapping[str, ArrayLike] | None = None,
                  constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (),
                  grid: ArrayLike | int | None = None, draws: int = 256, validate_args: bool | None = None):
@@ -129,11 +133,12 @@ class MarginalLikelihood(SeriesLikelihood):
         check_iterations(iterations or 0, damping, tolerance)
         if tolerance is not None:
             checks.positive("tolerance", tolerance, "It is in standard deviations, 0.001 for example.")
+        checks.one_of("method", method, METHODS)
         if sites is not None and not isinstance(model.observation, ObservationFamily):
             raise ValueError("sites are for an observation family such as lfm.PoissonObservation; the observation of "
                              "this model is Gaussian, whose filter needs none. Leave out sites.")
         self.max_step, self.damping = max_step, damping
-        self.tolerance = None if tolerance is None else float(tolerance)
+        self.tolerance, self.method = None if tolerance is None else float(tolerance), method
         self.sites = None if sites is None else as_settings(sites)
         super().__init__(model, times, rule, steps)
         self.iterations = self._default_iterations() if iterations is None else iterations
@@ -147,7 +152,7 @@ class MarginalLikelihood(SeriesLikelihood):
     def settings(self) -> dict[str, Any]:
         """Arguments besides model and times."""
         return {name: getattr(self, name) for name in ("rule", "steps", "max_step", "iterations", "damping",
-                                                       "tolerance", "sites")}
+                                                       "tolerance", "method", "sites")}
 
     @property
     def description(self) -> str:
@@ -227,9 +232,9 @@ def _check_model(model: Any) -> None:
 
 
 def _refuse_filter_settings(max_step: Any = None, iterations: Any = None, damping: float = 0.7, tolerance: Any = None,
-                            sites: Any = None, validate_args: Any = None) -> None:
+                            sites: Any = None, method: Any = None, validate_args: Any = None) -> None:
     """Raise ValueError for a setting of the filter that a likelihood under constraints does not have."""
-    for name, value in (("max_step", max_step), ("tolerance", tolerance)):
+    for name, value in (("max_step", max_step), ("tolerance", tolerance), ("method", method)):
         if value is not None:
             raise ValueError(f"{name} is not supported under constraints, which add rows to the grid; raise steps.")
     if iterations:

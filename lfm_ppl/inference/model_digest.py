@@ -119,5 +119,5 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
             self.settings += repr((boxes.constraints.labels, distribution.grid, distribution.draws))
         else:
             self.settings += repr((distribution.max_step, distribution.iterations, distribution.damping,
-                                   distribution.tolerance, distribution.sites))
+                                   distribution.tolerance, distribution.method, distribution.sites))
         return super().replacement(likelihood, site)

@@ -20,6 +20,7 @@ from numpyro.distributions import constraints
 
 from lfm_ppl.filtering.arguments import as_rule
 from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.intervals import RUNGE_KUTTA
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
@@ -143,7 +144,7 @@ class Panel(dist.Distribution):
 
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayLike, rule: Rule | None = None,
           steps: int = 10, max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
-          tolerance: float | None = None, sites: SiteSettings | str | None = None) -> Panel:
+          tolerance: float | None = None, sites: SiteSettings | str | None = None, method: str = RUNGE_KUTTA) -> Panel:
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.
 
     The plate's name is the dimension of the series in the result of `lfm_ppl.fit`; `lfm_ppl.select_series` returns one
@@ -153,13 +154,14 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         build: maps the parameters of ONE series to its `LatentForceModel`; it may close over shared parameters.
         parameters: pytree of arrays with a leading axis (B,), one entry a series.
         times: (T,) for all, or (B, T); ragged series are padded: NaN in y, and times that repeat the last one.
-        rule: as in `MarginalLikelihood`, and so are the next six.
+        rule: as in `MarginalLikelihood`, and so are the next seven.
         steps: integration steps between two consecutive times.
         max_step: longest step.
         iterations: of posterior linearisation; by default 3 for models that are not linear, see `MarginalLikelihood`.
         damping: largest share of each new iterate that is taken; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations; None for equal steps.
         sites: of an observation family.
+        method: of integration.
 
     Returns:
         A distribution with batch shape (B,) and event shape (T, D).
@@ -178,5 +180,5 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         (2,)
     """
     settings = {"rule": as_rule(rule), "steps": steps, "max_step": max_step, "iterations": iterations,
-                "damping": damping, "tolerance": tolerance, "sites": sites}
+                "damping": damping, "tolerance": tolerance, "sites": sites, "method": method}
     return Panel(build, parameters, times, settings)

@@ -26,7 +26,7 @@ from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.filter import FilterResult, filter_on
 from lfm_ppl.filtering.forward import forward
-from lfm_ppl.filtering.intervals import TimeGrid
+from lfm_ppl.filtering.intervals import RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_linear, is_observation_nonlinear
 from lfm_ppl.filtering.smoother import SmootherResult, smooth_on
@@ -57,6 +57,7 @@ class SeriesLikelihood(dist.Distribution):
     iterations: int = 0
     damping: float = 0.7
     tolerance: float | None = None
+    method: str = RUNGE_KUTTA
     sites: SiteSettings | None = None
 
     def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None, steps: int) -> None:
@@ -77,7 +78,8 @@ class SeriesLikelihood(dist.Distribution):
     @functools.cached_property
     def time_grid(self) -> TimeGrid:
         """The time grid of the scan."""
-        return build_time_grid(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
+        return build_time_grid(self.ssm, self.times, self.steps, self.max_step,
+                               tolerance=self.tolerance)._replace(method=self.method)
 
     # Not cached: it is computed from traced parameters, inside the function that `finite_or_minus_infinity` guards.
     @property
@@ -109,6 +111,12 @@ class SeriesLikelihood(dist.Distribution):
     def description(self) -> str:
         """How the likelihood is computed: exact or by which approximation."""
         raise NotImplementedError
+
+    @property
+    def recorded_settings(self) -> dict[str, Any]:
+        """Settings of the filter as a result records them; what is None is not stored."""
+        return {"rule": self.rule.name, "steps": self.steps, "max_step": self.max_step, "iterations": self.iterations,
+                "tolerance": self.tolerance, "method": None if self.method == RUNGE_KUTTA else self.method}
 
     @property
     def site_settings(self) -> SiteSettings:
@@ -156,7 +164,8 @@ class SeriesLikelihood(dist.Distribution):
         Constraints are ignored.
         """
         steps = self.steps if steps is None else steps
-        grid = build_time_grid(self.ssm, self.times, steps, self.max_step, at, tolerance=self.tolerance)
+        grid = build_time_grid(self.ssm, self.times, steps, self.max_step, at,
+                               tolerance=self.tolerance)._replace(method=self.method)
         y = self.checked(y)
         return smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
 

@@ -91,9 +91,7 @@ def check_likelihood(result: Any, log_likelihood: np.ndarray, draw_index: np.nda
 
 def _check_settings(site: LikelihoodSite, attrs: Mapping[str, Any]) -> None:
     example = site.example
-    settings = {"rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
-           "iterations": example.iterations, "tolerance": example.tolerance,
-           "constraints": example.constraints_in_words or None}
+    settings = {**example.recorded_settings, "constraints": example.constraints_in_words or None}
     if not set(settings) & set(attrs):
         return  # not made by `fit`
     for name in settings:

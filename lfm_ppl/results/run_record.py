@@ -38,7 +38,8 @@ def digest(*values: Any) -> str:
 
 _DIGEST = "sha256:"
 
-_MODEL_SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance", "constraints", "sites", "fixed")
+_MODEL_SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance", "method", "constraints", "sites",
+                   "fixed")
 """Entries of a record that the digest of the model depends on."""
 
 

@@ -75,8 +75,7 @@ class FitOptions:
         """Return the attributes of the result on the likelihood and the sampler."""
         example = bound.site.example
         return {
-            "rule": example.rule.name, "steps": example.steps, "max_step": example.max_step,
-            "iterations": example.iterations, "tolerance": example.tolerance, "sampler": self.sampler,
+            **example.recorded_settings, "sampler": self.sampler,
             "likelihood": ("estimated without bias (particle filter)" if self.sampler == "pmmh"
                            else example.description),
             "seed": self.seed, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,

@@ -108,9 +108,7 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: ArrayLike, y: ArrayLike,
     kernel = getattr(mcmc, "sampler", None)
     attrs = {
         "model": name or getattr(numpyro_model, "__name__", "model"), "description": model_docstring(numpyro_model),
-        "rule": example.rule.name,
-        "steps": example.steps, "max_step": example.max_step, "iterations": example.iterations,
-        "tolerance": example.tolerance, "sampler": "draws" if kernel is None else type(kernel).__name__.lower(),
+        **example.recorded_settings, "sampler": "draws" if kernel is None else type(kernel).__name__.lower(),
         "chains": chains, "samples": samples, "fixed": "{}", "versions": json.dumps(versions()),
         "created_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "constraints": example.constraints_in_words or None,

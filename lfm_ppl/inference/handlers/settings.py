@@ -9,8 +9,8 @@ from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.panel import Panel
 
-NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "sites", "lower", "upper", "constraints",
-         "grid", "draws")
+NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "method", "sites", "lower", "upper",
+         "constraints", "grid", "draws")
 
 
 class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
@@ -18,10 +18,10 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
 
     Args:
         fn: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
-        **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping``, ``tolerance``, ``sites``,
-            ``lower``, ``upper``, ``constraints``, ``grid`` and ``draws``; what is None or left out stays as the model
-            has it. But ``steps`` or ``iterations`` without a tolerance remove the tolerance of the model, and a
-            tolerance or constraints remove its iterations.
+        **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping``, ``tolerance``, ``method``,
+            ``sites``, ``lower``, ``upper``, ``constraints``, ``grid`` and ``draws``; what is None or left out
+            stays as the model has it. But ``steps`` or ``iterations`` without a tolerance remove the tolerance of the
+            model, and a tolerance or constraints remove its iterations.
 
     Raises:
         TypeError: for a setting of another name.
