@@ -26,8 +26,8 @@ class InputTable(NamedTuple):
     """A known input as it was measured.
 
     Attributes:
-        times: (K,), increasing; (B, K) for doses to the series of a panel.
-        values: of the same shape.
+        times: (K,), increasing.
+        values: (K,).
         interpolation: "previous", "linear", or "dose:STATE" for doses.
     """
 
@@ -151,18 +151,10 @@ def as_inputs(tables: Mapping[str, InputTable]) -> dict[str, Input]:
 
 
 def as_doses(tables: Mapping[str, InputTable]) -> list[Dose]:
-    """Return the doses among known inputs; those to the series of a panel have a leading axis."""
-    import jax
-
+    """Return the doses among known inputs."""
     from lfm_ppl.model.events import Dose
 
-    doses = []
-    for table in tables.values():
-        if table.dosed_state:
-            pairs = zip(np.atleast_2d(table.times), np.atleast_2d(table.values), strict=True)
-            rows = [Dose(times, amounts, table.dosed_state) for times, amounts in pairs]
-            doses.append(rows[0] if table.times.ndim == 1 else jax.tree.map(lambda *a: np.stack(a), *rows))
-    return doses
+    return [Dose(table.times, table.values, table.dosed_state) for table in tables.values() if table.dosed_state]
 
 
 def model_keywords(tables: Mapping[str, InputTable], model_kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -186,14 +178,13 @@ def at_origin(data: Data, origin: str, unit: str) -> Data:
 def stack_series(series: Mapping[str, Data]) -> Data:
     """Return the series of a panel as one data set, for a model with `lfm_ppl.panel`.
 
-    Shorter series are padded with rows that are all missing, at their last time, and with doses of zero.
+    Shorter series are padded with rows that are all missing, at their last time.
 
     Args:
         series: label -> observations, as of `lfm_ppl.data.read_series`.
 
     Raises:
-        ValueError: a series has known inputs that are not doses, or other outputs or doses than the first one; not all
-            times are dates.
+        ValueError: a series has known inputs, or other outputs than the first one; not all times are dates.
 
     Example:
         >>> short, long = Data([0.0], [[1.0]], ("x",)), Data([0.0, 2.0], [[1.5], [0.5]], ("x",))
@@ -203,32 +194,19 @@ def stack_series(series: Mapping[str, Data]) -> Data:
     """
     label, first = next(iter(series.items()))
     for name, data in series.items():
-        if functions := [key for key, table in data.inputs.items() if not table.dosed_state]:
-            raise ValueError(f"series {name!r} has the known input {functions[0]!r}, which the series of a file cannot "
-                             "have in a panel; give it to lfm.fit by model_kwargs=.")
-        if any((data.outputs != first.outputs, [*data.inputs] != [*first.inputs],
-                (data.origin is None) != (first.origin is None))):
-            raise ValueError(f"series {name!r} must have the outputs {', '.join(first.outputs)}, the same doses, and "
-                             f"dates or numbers as times, as series {label!r}.")
+        if data.inputs:
+            raise ValueError(f"series {name!r} has the known input {next(iter(data.inputs))!r}, which the series of a "
+                             "file cannot have in a panel; give it to lfm.fit by model_kwargs=.")
+        if (data.outputs, data.origin is None) != (first.outputs, first.origin is None):
+            raise ValueError(f"series {name!r} must have the outputs {', '.join(first.outputs)} and dates or numbers as"
+                             f" times, as series {label!r}.")
     if first.origin is not None:
         origin = min(str(data.origin) for data in series.values())
         series = {name: at_origin(data, origin, first.units["time"]) for name, data in series.items()}
     rows = max(len(data.times) for data in series.values())
     times = [np.pad(data.times, (0, rows - len(data.times)), "edge") for data in series.values()]
     y = [np.pad(data.y, ((0, rows - len(data.y)), (0, 0)), constant_values=np.nan) for data in series.values()]
-    doses = {name: _stack_doses([data.inputs[name] for data in series.values()], times) for name in first.inputs}
-    return replace(next(iter(series.values())), times=np.array(times), y=np.array(y), inputs=doses,
-                   series=tuple(series))
-
-
-def _stack_doses(tables: list[InputTable], times: list[np.ndarray]) -> InputTable:
-    """Return the doses (B, K) to the series of a panel, padded with doses of zero at the first time of the series."""
-    count = max(len(table.times) for table in tables)
-    padding = [(count - len(table.times), row[0]) for table, row in zip(tables, times, strict=True)]
-    return InputTable(
-        np.array([np.append(np.full(*pad), table.times) for pad, table in zip(padding, tables, strict=True)]),
-        np.array([np.append(np.zeros(pad[0]), table.values) for pad, table in zip(padding, tables, strict=True)]),
-        tables[0].interpolation)
+    return replace(next(iter(series.values())), times=np.array(times), y=np.array(y), series=tuple(series))
 
 
 def fill_blanks(label: str, remedy: str, times: np.ndarray, values: np.ndarray, interpolation: str) -> np.ndarray:

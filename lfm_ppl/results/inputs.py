@@ -22,19 +22,13 @@ ORIGIN = "time_origin"
 """Attribute of a result: the calendar time of t = 0 as ISO 8601 text."""
 
 
-def to_dataset(inputs: Mapping[str, InputTable], units: Mapping[str, str] | None = None,
-               series: str = "series") -> xr.Dataset:
-    """Return known inputs, each over times of its own, with the units of those that have one.
-
-    ``series`` is the dimension of the series of a panel, which have doses of their own.
-    """
-    dims = {name: (f"{name}_time",) if np.ndim(table.times) == 1 else (series, f"{name}_row")
-            for name, table in inputs.items()}
+def to_dataset(inputs: Mapping[str, InputTable], units: Mapping[str, str] | None = None) -> xr.Dataset:
+    """Return known inputs, each over times of its own, with the units of those that have one."""
     return xr.Dataset(
-        {name: (dims[name], np.asarray(table.values),
+        {name: (f"{name}_time", np.asarray(table.values),
                 {"interpolation": table.interpolation, **units_attribute([name], units)})
          for name, table in inputs.items()},
-        {f"{name}_time": (dims[name], np.asarray(table.times)) for name, table in inputs.items()})
+        {f"{name}_time": np.asarray(table.times) for name, table in inputs.items()})
 
 
 def inputs_of(result: Any, group: str = GROUP) -> dict[str, InputTable]:
@@ -70,8 +64,7 @@ def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | Non
         Attributes of the result.
     """
     if data is not None and data.inputs:
-        dimensions = [str(name) for name in groups["observed_data"].dims if name not in ("time", "output")]
-        groups[GROUP] = to_dataset(data.inputs, data.units, *dimensions)
+        groups[GROUP] = to_dataset(data.inputs, data.units)
     for dataset in groups.values():
         for name in {"time", "at", "at_truth", "times"} & set(dataset.coords):
             if unit and not dataset[name].attrs.get("units"):

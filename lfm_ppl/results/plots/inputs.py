@@ -86,8 +86,7 @@ def _draw_function(axes: Axes, table: InputTable, end: float) -> None:
 
 def _draw_doses(axes: Axes, table: InputTable) -> None:
     """Draw doses as stems from zero."""
-    times, amounts = np.ravel(table.times), np.ravel(table.values)  # of all series of a panel
-    axes.vlines(times, 0.0, amounts, color=style.PURPLE, lw=1.2, label="dose")
-    axes.plot(times, amounts, "o", ms=2.2, color=style.PURPLE, mew=0)
+    axes.vlines(table.times, 0.0, table.values, color=style.PURPLE, lw=1.2, label="dose")
+    axes.plot(table.times, table.values, "o", ms=2.2, color=style.PURPLE, mew=0)
     low, high = table.values.min(initial=0.0), table.values.max(initial=0.0)
     axes.set_ylim(1.1 * low, 1.1 * high if high > low else 1.0)
