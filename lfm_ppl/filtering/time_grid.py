@@ -131,9 +131,7 @@ def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_
                              "initial_time or `start`) that are known before compilation; pass NumPy arrays rather "
                              "than traced values, and do not convert them with jnp inside the model.")
         part = division.steps_per_interval(np.full(np.shape(times)[0], steps))
-        grid = _grid_from_traced_times(times, -(-steps // part), part, initial_time)
-        if requested_times is not None:
-            grid = _grid_from_traced_request(times, requested_times, part, initial_time)
+        grid = _grid_from_traced_times(times, -(-steps // part), part, initial_time, requested_times)
     intervals = grid.intervals
     inner = inset(intervals.start, intervals.end, intervals.length, division.scale)
     return _insert_traced_times(grid._replace(intervals=intervals._replace(inset=inner)), breakpoints, events,
@@ -262,9 +260,20 @@ def longest_step(ssm: StateSpaceModel, times: Any, origin: Any, steps: int) -> f
     return max(2.0 * float(np.median(gaps)), float(np.mean(gaps)) / _MOST_STEPS) / steps
 
 
-def _grid_from_traced_times(times: Any, pieces: int, steps: int, initial_time: Any) -> TimeGrid:
-    """Return ``pieces`` intervals of ``steps`` steps each between two times."""
+def _grid_from_traced_times(times: Any, pieces: int, steps: int, initial_time: Any,
+                            requested_times: Any = None) -> TimeGrid:
+    """Return ``pieces`` intervals of ``steps`` steps each between two times, requested ones included."""
     times = jnp.asarray(times, float)
+    if requested_times is not None:
+        count = times.shape[0]
+        nodes = jnp.concatenate([times, jnp.asarray(requested_times, float)])
+        order = jnp.argsort(nodes, stable=True)  # an observation comes before a request of the same time
+        grid = _grid_from_traced_times(nodes[order], pieces, steps, times[0] if initial_time is None else initial_time)
+        last = jnp.asarray(grid.observed)[jnp.argsort(order)]
+        node = jnp.asarray(grid.intervals.observation)
+        observation = jnp.where((node >= 0) & (order[node] < count), order[node], -1)
+        return grid._replace(intervals=grid.intervals._replace(observation=observation), observed=last[:count],
+                             requested=last[count:], requested_times=nodes[count:])
     origin = times[:1] if initial_time is None else jnp.reshape(jnp.asarray(initial_time, float), (1,))
     start = jnp.concatenate([origin, times[:-1]])
     width = jnp.repeat((times - start) / pieces, pieces)
@@ -277,18 +286,6 @@ def _grid_from_traced_times(times: Any, pieces: int, steps: int, initial_time: A
     observation[last] = np.arange(times.shape[0])
     intervals = intervals_between(start, end, width, observation, np.full(observation.shape, -1))
     return TimeGrid(intervals, None, last, last, times, steps, origin[0], since=since)
-
-
-def _grid_from_traced_request(times: Any, requested_times: Any, steps: int, initial_time: Any) -> TimeGrid:
-    """Return an interval of ``steps`` steps between any two consecutive ones of all times, (T,) and (K,), sorted."""
-    count = np.shape(times)[0]
-    nodes = jnp.concatenate([jnp.asarray(times, float), jnp.asarray(requested_times, float)])
-    order = jnp.argsort(nodes, stable=True)
-    position = jnp.argsort(order)
-    grid = _grid_from_traced_times(nodes[order], 1, steps, times[0] if initial_time is None else initial_time)
-    observation = jnp.concatenate([jnp.arange(count), jnp.full(np.shape(requested_times), -1)])[order]
-    return grid._replace(intervals=grid.intervals._replace(observation=observation), observed=position[:count],
-                         requested=position[count:], requested_times=nodes[count:])
 
 
 def _grid_from_traced_origin(times: np.ndarray, origin: Any, jumps: tuple[float, ...], steps: int,

@@ -65,6 +65,25 @@ def together():
     return lambda *arguments: jax.tree.map(np.asarray, compiled(*arguments))
 
 
+def test_requested_times_that_are_traced_are_nodes(y):
+    """With a known input, whose jump divides intervals and their steps."""
+    heat = lfm.Input([0.0, 0.8, 2.2], [0.0, 1.0, 0.3], interpolation="previous", outside="hold")
+    model = lfm.LatentForceModel(
+        lambda x, u, t: u + heat(t) - x**3, {"u": lfm.Matern(1.0, LENGTHSCALE)},
+        lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.05])), lfm.Gaussian(jnp.zeros(1), 0.2 * jnp.eye(1)))
+    requested = np.array([1.0, 0.5, 3.0, 4.0])
+
+    @jax.jit
+    def smooth(times, requested):
+        result = lfm.MarginalLikelihood(model, times, iterations=0).smooth(y[0], requested)
+        return result.mean, result.covariance, result.log_likelihood
+
+    expected = lfm.smooth(model, TIMES, y[0], at=requested, steps=40)
+    for computed, exact in zip(smooth(TIMES, requested), (
+            expected.mean, expected.covariance, expected.log_likelihood), strict=True):
+        np.testing.assert_allclose(computed, exact, atol=2e-5)
+
+
 def test_panel_equals_a_loop(y, looped):
     results, _ = looped
 
