@@ -166,12 +166,9 @@ def _table(forecast: Any) -> pd.DataFrame:
     dimension = series_dimension(forecast)
     if dimension is None:
         return summary(arviz_data.group(forecast, GROUP))
-    tables_of_series = []
-    for label in series_labels(forecast):
-        table = summary(arviz_data.group(select_series(forecast, label), GROUP))
-        table.insert(0, dimension, label)
-        tables_of_series.append(table)
-    return pd.concat(tables_of_series)
+    summaries = {label: summary(arviz_data.group(select_series(forecast, label), GROUP))
+                 for label in series_labels(forecast)}
+    return pd.concat(summaries, names=[dimension]).reset_index(level=0)
 
 
 def _figures(forecast: Any) -> Iterator[tuple[str, Callable]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,6 +20,9 @@ INTERPOLATIONS = ("previous", "linear", "zero")
 
 DOSE = "dose:"
 """Beginning of ``dose:STATE``, which reads a known input as doses to a state."""
+
+OF_SERIES = " of series "
+"""Between the name of a known input and the label of its series in a panel."""
 
 
 class InputTable(NamedTuple):
@@ -147,14 +150,39 @@ def as_inputs(tables: Mapping[str, InputTable]) -> dict[str, Input]:
     # Here and not before: arrays made before float64 is enabled stay in float32.
     from lfm_ppl.model.inputs import Input
 
-    return {name: Input(*table, name=name) for name, table in tables.items() if not table.dosed_state}
+    functions = {name: table for name, table in tables.items() if not table.dosed_state}
+    return _by_name(functions, lambda name, table: Input(*table, name=name))
 
 
 def as_doses(tables: Mapping[str, InputTable]) -> list[Dose]:
     """Return the doses among known inputs."""
     from lfm_ppl.model.events import Dose
 
-    return [Dose(table.times, table.values, table.dosed_state) for table in tables.values() if table.dosed_state]
+    doses = {name: table for name, table in tables.items() if table.dosed_state}
+    return list(_by_name(doses, lambda name, table: Dose(table.times, table.values, table.dosed_state)).values())
+
+
+def _by_name(tables: Mapping[str, InputTable], make: Callable[[str, InputTable], Any]) -> dict[str, Any]:
+    """Return name -> ``make(name, table)``, stacked where each series of a panel has one."""
+    import jax
+
+    groups: dict[str, list[InputTable]] = {}
+    for name, table in tables.items():
+        groups.setdefault(name.partition(OF_SERIES)[0], []).append(table)
+    made = {}
+    for name, members in groups.items():
+        size = max(len(table.times) for table in members)
+        entries = [make(name, _padded(table, size)) for table in members]
+        made[name] = entries[0] if name in tables else jax.tree.map(lambda *leaves: np.stack(leaves), *entries)
+    return made
+
+
+def _padded(table: InputTable, size: int) -> InputTable:
+    """Return a table with ``size`` rows: doses of zero, or the last value, follow the last time."""
+    count = size - len(table.times)
+    times = np.append(table.times, table.times.max(initial=0.0) + np.arange(1, count + 1))
+    last = 0.0 if table.dosed_state else table.values[-1]
+    return table._replace(times=times, values=np.append(table.values, np.full(count, last)))
 
 
 def model_keywords(tables: Mapping[str, InputTable], model_kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -178,13 +206,15 @@ def at_origin(data: Data, origin: str, unit: str) -> Data:
 def stack_series(series: Mapping[str, Data]) -> Data:
     """Return the series of a panel as one data set, for a model with `lfm_ppl.panel`.
 
-    Shorter series are padded with rows that are all missing, at their last time.
+    Shorter series are padded with rows that are all missing, at their last time. Known inputs are named after their
+    series, "dose of series Ann". The model gets them stacked, with a leading axis for the series, so that they can be
+    entries of ``parameters`` of the panel.
 
     Args:
         series: label -> observations, as of `lfm_ppl.data.read_series`.
 
     Raises:
-        ValueError: a series has known inputs, or other outputs than the first one; not all times are dates.
+        ValueError: a series has other outputs or known inputs than the first one; not all times are dates.
 
     Example:
         >>> short, long = Data([0.0], [[1.0]], ("x",)), Data([0.0, 2.0], [[1.5], [0.5]], ("x",))
@@ -194,19 +224,20 @@ def stack_series(series: Mapping[str, Data]) -> Data:
     """
     label, first = next(iter(series.items()))
     for name, data in series.items():
-        if data.inputs:
-            raise ValueError(f"series {name!r} has the known input {next(iter(data.inputs))!r}, which the series of a "
-                             "file cannot have in a panel; give it to lfm.fit by model_kwargs=.")
-        if (data.outputs, data.origin is None) != (first.outputs, first.origin is None):
-            raise ValueError(f"series {name!r} must have the outputs {', '.join(first.outputs)} and dates or numbers as"
-                             f" times, as series {label!r}.")
+        if (data.outputs, list(data.inputs), data.origin is None) != (
+                first.outputs, list(first.inputs), first.origin is None):
+            raise ValueError(f"series {name!r} must have the outputs and known inputs of series {label!r} "
+                             f"({', '.join((*first.outputs, *first.inputs))}), and dates or numbers as times like it.")
     if first.origin is not None:
         origin = min(str(data.origin) for data in series.values())
         series = {name: at_origin(data, origin, first.units["time"]) for name, data in series.items()}
     rows = max(len(data.times) for data in series.values())
     times = [np.pad(data.times, (0, rows - len(data.times)), "edge") for data in series.values()]
     y = [np.pad(data.y, ((0, rows - len(data.y)), (0, 0)), constant_values=np.nan) for data in series.values()]
-    return replace(next(iter(series.values())), times=np.array(times), y=np.array(y), series=tuple(series))
+    inputs = {f"{name}{OF_SERIES}{label}": table for label, data in series.items()
+              for name, table in data.inputs.items()}
+    return replace(next(iter(series.values())), times=np.array(times), y=np.array(y), inputs=inputs,
+                   series=tuple(series))
 
 
 def fill_blanks(label: str, remedy: str, times: np.ndarray, values: np.ndarray, interpolation: str) -> np.ndarray:

@@ -38,7 +38,7 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
 
-from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, Data
+from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, OF_SERIES, Data
 from lfm_ppl.utils import checks
 
 _MODULE = "_lfm_ppl_model_"  # prefix of the names of the modules of model files
@@ -108,7 +108,7 @@ class ModelFile:
                 raise ValueError(f"{self.path}: the data have the {kind} {name!r}, and model(...) has no argument "
                                  f"`{argument}` to take {'them' if table.dosed_state else 'it'} by.")
         for name in self.inputs:
-            if name not in data.inputs:
+            if name not in {key.partition(OF_SERIES)[0] for key in data.inputs}:
                 raise ValueError(f"{self.name} needs the known input {name!r}, which the data do not have.")
         return keywords | {name: value for name, value in from_data.items() if name in parameters}
 

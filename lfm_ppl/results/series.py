@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from lfm_ppl.io.data_set import OF_SERIES
 from lfm_ppl.results import arviz_data
 from lfm_ppl.utils import checks
 
@@ -105,6 +106,9 @@ def select_series(result: Any, series: Any) -> Any:
             dataset = dataset.isel(time=has_scores)
         elif label in ("observed_data", "one_step_ahead", "posterior_predictive"):
             dataset = dataset.isel(time=is_observed[index] | is_later)
+        elif label == "constant_data":
+            names = {str(name): str(name).partition(OF_SERIES) for name in dataset}
+            dataset = dataset[[name for name, (_, _, owner) in names.items() if owner in ("", str(labels[index]))]]
         groups[label] = dataset
     times = groups["observed_data"]["time"].values[groups["observed_data"][name].notnull().any("output").values]
     if "predictions" in groups:

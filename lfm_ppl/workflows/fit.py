@@ -121,8 +121,8 @@ def fit(
             are cheap and short, and 2 for each parameter for particle-marginal RAM.
         seed: seed of all random numbers.
         at: times of the trajectories, and of new observations; by default a grid over the data. Times after the last
-            observation are forecasts, see `forecast`. Dates where the times of the data are dates; numbers are in the
-            unit of the `lfm.Data`, or else of the model.
+            observation are forecasts, see `forecast`. (B, K) for series that have their own times. Dates where the
+            times of the data are dates; numbers are in the unit of the `lfm.Data`, or else of the model.
         trajectory_draws: number of posterior draws, spread over the chains, that get a trajectory; 0: none.
         model_kwargs: keyword arguments of the model.
         fixed: fixed parameters: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.

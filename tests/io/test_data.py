@@ -181,7 +181,21 @@ def test_series_are_stacked_with_rows_all_missing_and_one_origin(write):
     assert panel.series == ("b", "a") and panel.origin == "2026-01-04T00:00:00"
     np.testing.assert_array_equal(panel.times, [[30.0, 42.0], [12.0, 12.0]])
     np.testing.assert_array_equal(panel.y[..., 0], [[1.0, 3.0], [2.0, np.nan]])
-    with pytest.raises(ValueError, match="known input"):
-        stack_series({"a": Data([0.0], [[1.0]], ("x",), inputs={"dose": ([0.0], [1.0])})})
+    with pytest.raises(ValueError, match="known inputs"):
+        stack_series({"a": Data([0.0], [[1.0]], ("x",), inputs={"dose": ([0.0], [1.0])}),
+                      "b": Data([0.0], [[1.0]], ("x",))})
     with pytest.raises(ValueError, match="'b'"):
         stack_series({"a": Data([0.0], [[1.0]], ("x",)), "b": Data([0.0], [[1.0]], ("z",))})
+
+
+def test_known_inputs_of_series_are_stacked_for_the_model():
+    def data(times, values):
+        return Data([0.0, 1.0], [[1.0], [2.0]], ("x",), inputs={
+            "dose": (times, values, "dose:gut"), "heat[K]": ([0.0, *times[1:]], values)})
+
+    panel = stack_series({"a": data([0.0], [3.0]), "b": data([0.5, 2.0], [1.0, 4.0])})
+    (dose,), heat = panel.doses(), panel.known_inputs()["heat[K]"]
+    assert dose.state == "gut" and list(panel.inputs)[0] == "dose of series a"
+    np.testing.assert_array_equal(dose.times, [[0.0, 1.0], [0.5, 2.0]])
+    np.testing.assert_array_equal(dose.values, [[3.0, 0.0], [1.0, 4.0]])
+    np.testing.assert_array_equal(heat.values, [[3.0, 3.0], [1.0, 4.0]])

@@ -58,6 +58,7 @@ def plot_residuals(result: Any, outputs: Sequence[str] | None = None, *, series:
         ValueError: the group is missing, or an output is unknown.
 
     Example:
+        >>> import xarray as xr
         >>> from lfm_ppl.results.arviz_data import build
         >>> residual = np.random.default_rng(0).normal(size=(1, 1, 50, 1))
         >>> scores = xr.Dataset({"residual": (("chain", "draw", "time", "output"), residual)})
