@@ -66,3 +66,31 @@ def test_doses_of_a_file_reach_the_fit_and_the_forecast(files, run):
 def test_a_column_without_a_state_is_refused(files, run):
     status, _, errors = run(f"fit {files}/drug.py --data {files}/drug.csv --events AMT")
     assert status == 2 and "--events takes COLUMN:STATE" in errors
+
+
+PANEL = MODEL.replace("""    ke = numpyro.sample("ke", dist.LogNormal(-1.0, 0.5))
+    system = lfm""", """    def build(p):
+      ke = p["ke"]
+      return lfm""").replace("""        events=events)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+""", """        events=p["events"])
+
+    with numpyro.plate("subject", len(times)):
+        ke = numpyro.sample("ke", dist.LogNormal(-1.0, 0.5))
+        numpyro.sample("y", lfm.panel(build, {"ke": ke, "events": events}, times), obs=y)
+""")
+
+
+def test_subjects_of_a_file_are_fitted_together_with_their_doses(files, run):
+    (files / "panel.py").write_text(PANEL)
+    rows = [f"{subject},{row}" for subject, shift in (("Ann", 0), ("Bo", 2)) for row in ROWS.splitlines()[1 + shift:]]
+    rows[4] = rows[4].replace(",8,4,", ",8,,")  # Ann has one dose
+    (files / "panel.csv").write_text("\n".join(["subject,time,AMT,blood", *rows, ""]))
+    status, _, errors = run(f"fit {files}/panel.py --data {files}/panel.csv --series subject --events AMT:gut "
+                            "--sampler map --samples 20 --out panel")
+    assert status == 0, errors
+    result = arviz_data.load("panel")
+    doses = arviz_data.group(result, "constant_data")
+    assert doses["AMT of series Ann"].values.tolist() == [4.0] and doses["AMT of series Bo"].values.tolist() == [4.0]
+    alone = arviz_data.group(lfm.select_series(result, "Ann"), "constant_data")
+    assert list(alone) == ["AMT of series Ann"]
