@@ -17,8 +17,8 @@ import lfm_ppl as lfm
 # What is measured: one column of the data file for each name, beside a column `time` (or `time_h`, with its unit).
 OUTPUTS = ("temperature",)
 
-# What is known at all times, as columns of the data file: name -> "previous" (a value holds to the next), "linear", or
-# "zero" ("previous", with blank cells read as zero, as of a dose).
+# What is known at all times, as columns of the data file: name -> "previous" (a value holds to the next), "linear",
+# "zero" ("previous", with blank cells read as zero), or "dose:STATE" (doses, which model(...) takes as `events`).
 # Then `def model(times, y=None, inputs=None)`, and in the dynamics inputs["outside"](t) in place of OUTSIDE.
 # INPUTS = {"outside": "linear"}
 
