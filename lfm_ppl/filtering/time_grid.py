@@ -12,14 +12,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.filtering.grid_layout import (
+    BEFORE_JUMP,
+    EVENT_AFTER,
+    EVENT_BEFORE,
+    JUMP,
+    OBSERVATION,
+    GridLayout,
+    insert_traced_times,
+    time_scale,
+)
 from lfm_ppl.filtering.intervals import TimeGrid, intervals_between
 from lfm_ppl.model.events import EventTable, event_table
 from lfm_ppl.model.inputs import InputRead, breakpoints_within
@@ -41,9 +49,6 @@ _REPLICATED = 0.2
 LONGEST_FORECAST = 10_000
 """Largest number of intervals of a forecast, each as long as the usual distance of two observations."""
 
-_BEFORE_JUMP, _JUMP, _EVENT_BEFORE, _OBSERVATION, _EVENT_AFTER = range(5)
-"""Order of what happens at one time."""
-
 _MOST_STEPS = 20.0
 """Bound on the number of steps with the default longest step, as a multiple of the number without one."""
 
@@ -51,6 +56,15 @@ _MOST_STEPS = 20.0
 def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None = None,
                     requested_times: Any = None, initial_time: Any = None, interval_per_step: bool = False,
                     tolerance: float | None = None) -> TimeGrid:
+    """Return the intervals of the scan; arguments and errors as `lay_out_time_grid`."""
+    layout, reads, events = lay_out_time_grid(ssm, times, steps, max_step, requested_times, initial_time,
+                                              interval_per_step, tolerance)
+    return layout.complete(reads, events)
+
+
+def lay_out_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: float | None = None,
+                      requested_times: Any = None, initial_time: Any = None, interval_per_step: bool = False,
+                      tolerance: float | None = None) -> tuple[GridLayout, list[InputRead], EventTable]:
     """Lay out the intervals of the scan.
 
     Args:
@@ -64,6 +78,10 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
         initial_time: overrides that of the model (when the scan starts from a filter's state).
         interval_per_step: make every integration step an interval, for a particle smoother.
         tolerance: of the error of a step, see `TimeGrid`.
+
+    Returns:
+        The layout, the reads of the known inputs and the events. Where times or the initial time are traced, so is the
+        layout.
 
     Raises:
         ValueError, TypeError: see `lfm_ppl.model.state_space.check_times`; non-positive steps or tolerance; a requested
@@ -83,34 +101,40 @@ def build_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: floa
     start = concrete_times[0] if initial_time is None and concrete_times is not None else initial_time
     origin = None if start is None else checks.concrete(start)
     is_adaptive = tolerance is not None
+    reads: list[InputRead] = []
     if concrete_times is None or origin is None:
         division = Division(steps, max_step, interval_per_step, is_adaptive)
-        grid = _traced_grid(ssm, times, initial_time, requested_times, division, events)
+        layout = GridLayout(_traced_grid(ssm, times, initial_time, requested_times, division, events))
     else:
         longest = max_step
         if max_step is None and not is_adaptive:
             longest = longest_step(ssm, concrete_times, float(origin), steps)
         division = Division(steps, longest, interval_per_step, is_adaptive)
-        grid = _concrete_grid(ssm, concrete_times, float(origin), requested_times, division, events)
-    return grid if tolerance is None else grid._replace(tolerance=float(tolerance))
+        layout, reads = _concrete_layout(ssm, concrete_times, float(origin), requested_times, division, events)
+    if tolerance is not None:
+        layout = layout._replace(grid=layout.grid._replace(tolerance=float(tolerance)))
+    return layout, reads, events
 
 
-def _concrete_grid(ssm: StateSpaceModel, times: np.ndarray, origin: float, requested_times: Any,
-                   division: Division, events: EventTable) -> TimeGrid:
-    """Return the time grid for times that are known before compilation."""
+def _concrete_layout(ssm: StateSpaceModel, times: np.ndarray, origin: float, requested_times: Any,
+                     division: Division, events: EventTable) -> tuple[GridLayout, list[InputRead]]:
+    """Return the layout for times that are known before compilation, and the reads of known inputs."""
     requested = None if requested_times is None else _requested_times(requested_times, origin)
     end = float(times[-1] if requested is None else requested.max(initial=times[-1]))
     ssm.model.check_inputs(origin, end)
     reads = ssm.model.input_reads(origin, end)
     breakpoints, traced_breakpoints = breakpoints_within(reads, origin, end)
-    division = replace(division, 
-        breakpoints=breakpoints, traced_breakpoints=len(traced_breakpoints) + int(events.is_traced.sum()),
-        scale=_time_scale(reads),
+    scale = time_scale(reads)
+    division = replace(
+        division, breakpoints=breakpoints, traced_breakpoints=len(traced_breakpoints) + int(events.is_traced.sum()),
+        scale=0.0 if checks.traced(scale) else scale,
         overhead=_OVERHEAD_OF_EXACT if ssm.time_invariant else _OVERHEAD,
         is_exact=ssm.mean_invariant and division.max_step is None and not division.interval_per_step)
     events.check_start(origin)
     grid = _divide_times(times, origin, ssm.stack.jump_times, requested, division, events)
-    return _insert_traced_times(grid, traced_breakpoints, events, events.is_traced, division.scale)
+    is_lagged = tuple(checks.traced(read.breakpoints()) for read in reads)
+    return GridLayout(grid, tuple(read.breakpoint_rows for read in reads), is_lagged,
+                      tuple(events.is_traced.tolist())), reads
 
 
 def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_times: Any,
@@ -120,7 +144,7 @@ def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_
     span = (0.0, 1.0) if concrete_times is None else (float(concrete_times[0]), float(concrete_times[-1]))
     reads = ssm.model.input_reads(*span)
     breakpoints = jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
-    division = replace(division, traced_breakpoints=len(breakpoints) + len(events.times), scale=_time_scale(reads))
+    division = replace(division, traced_breakpoints=len(breakpoints) + len(events.times), scale=time_scale(reads))
     jumps, steps = ssm.stack.jump_times, division.steps
     is_concrete_request = requested_times is not None and not checks.traced(requested_times)
     if concrete_times is not None and jumps and division.max_step is None and requested_times is None:
@@ -134,8 +158,8 @@ def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_
         grid = _grid_from_traced_times(times, -(-steps // part), part, initial_time, requested_times)
     intervals = grid.intervals
     inner = inset(intervals.start, intervals.end, intervals.length, division.scale)
-    return _insert_traced_times(grid._replace(intervals=intervals._replace(inset=inner)), breakpoints, events,
-                                np.full(len(events.times), True), division.scale)
+    return insert_traced_times(grid._replace(intervals=intervals._replace(inset=inner)), breakpoints, events,
+                               np.full(len(events.times), True), division.scale)
 
 
 @dataclass(frozen=True)
@@ -194,48 +218,6 @@ class Division:
         cost = [(np.ceil(count / steps).sum() + self.traced_breakpoints) * (steps + self.overhead)
                 for steps in range(1, self.steps + 1)]
         return int(np.argmin(cost)) + 1
-
-
-def _time_scale(reads: Sequence[InputRead]) -> Any:
-    """Return the size of the numbers that inputs compare times with."""
-    sizes = [read.scale for read in reads]
-    return sum(sizes) if sizes else 0.0
-
-
-def _insert_traced_times(grid: TimeGrid, breakpoints: Any, events: EventTable, is_inserted: np.ndarray,
-                         scale: Any) -> TimeGrid:
-    """Return a time grid whose intervals end at traced breakpoints (K,) and at some of the events (E,) as well.
-
-    Their number is that of all breakpoints and events, wherever they lie: those outside of the grid's times end
-    intervals of length zero, and such events do not happen. The sorted times are continuous in the inserted times, and
-    differentiable but where two meet.
-    """
-    index = np.flatnonzero(is_inserted)
-    count = np.shape(breakpoints)[0]
-    if not count + len(index):
-        return grid
-    times = events.times if events.traced_times is None else events.traced_times
-    breakpoints = jnp.concatenate([breakpoints, jnp.asarray(times)[index]])
-    intervals, origin = grid.intervals, jnp.asarray(grid.initial_time, float)
-    since_end = jnp.append(jnp.asarray(grid.since)[1:], jnp.asarray(grid.since)[-1] + intervals.length[-1])
-    inserted = jnp.clip(breakpoints - origin, 0.0, since_end[-1])
-    merged = jnp.concatenate([since_end, inserted])
-    rank = np.concatenate([np.full(np.shape(since_end), _OBSERVATION), np.full(count, _EVENT_AFTER),
-                           np.where(events.observation_first[index], _EVENT_AFTER, _EVENT_BEFORE)])
-    order = jnp.lexsort((rank, jax.lax.stop_gradient(merged)))
-    position = jnp.argsort(order)
-    since_end = merged[order]
-    since = jnp.concatenate([jnp.zeros(1), since_end[:-1]])
-    end = jnp.concatenate([jnp.asarray(intervals.end), origin + inserted])[order]
-    start = jnp.concatenate([jnp.reshape(origin, (1,)), end[:-1]])
-    no_index = np.full(count + len(index), -1)
-    inserted_event = jnp.where(breakpoints - origin == inserted, np.append(no_index[:count], index), -1)
-    observation, jump, event = (
-        jnp.concatenate([jnp.asarray(a), b])[order]
-        for a, b in ((intervals.observation, no_index), (intervals.jump, no_index), (intervals.event, inserted_event)))
-    intervals = intervals_between(start, end, since_end - since, observation, jump, scale=scale, event=event)
-    return grid._replace(intervals=intervals, lengths=None, observed=position[jnp.asarray(grid.observed)],
-                         requested=position[jnp.asarray(grid.requested)], since=since)
 
 
 def longest_step(ssm: StateSpaceModel, times: Any, origin: Any, steps: int) -> float | None:
@@ -331,13 +313,13 @@ def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], re
     # node.
     before_jump = jump_time if division.interval_per_step else jump_time[:0]
     event_index = np.flatnonzero(events.times <= end)
-    event_rank = np.where(events.observation_first[event_index], _EVENT_AFTER, _EVENT_BEFORE)
+    event_rank = np.where(events.observation_first[event_index], EVENT_AFTER, EVENT_BEFORE)
     time = np.concatenate([before_jump, jump_time, times, events.times[event_index]])
-    rank = np.append(np.repeat([_BEFORE_JUMP, _JUMP, _OBSERVATION], [len(before_jump), len(jump_time), len(times)]),
+    rank = np.append(np.repeat([BEFORE_JUMP, JUMP, OBSERVATION], [len(before_jump), len(jump_time), len(times)]),
                      event_rank)
     observation, jump, event = (np.full(len(time), -1) for _ in range(3))
-    observation[rank == _OBSERVATION] = np.arange(len(times))
-    jump[rank == _JUMP] = jump_index
+    observation[rank == OBSERVATION] = np.arange(len(times))
+    jump[rank == JUMP] = jump_index
     event[len(time) - len(event_index):] = event_index
     order = np.lexsort((observation, rank, time))
     time, rank, observation, jump, event = (a[order] for a in (time, rank, observation, jump, event))
@@ -352,7 +334,7 @@ def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], re
         # After the last observation a whole interval is as long as the usual distance of two observations.
         whole_lengths = np.append(whole_lengths, _forecast_interval(times, float(cut[-1] - time[-1])))
         time, rank, observation, jump, event, whole_lengths, cuts = (np.insert(a, index, b) for a, b in (
-            (time, cut), (rank, _OBSERVATION), (observation, -1), (jump, -1), (event, -1),
+            (time, cut), (rank, OBSERVATION), (observation, -1), (jump, -1), (event, -1),
             (whole_lengths, whole_lengths[index]), (cuts, cuts[index])))
         whole_lengths, cuts = whole_lengths[:len(time)], cuts[:len(time)]
     begin = np.append(origin, time[:-1])
@@ -375,7 +357,7 @@ def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], re
     observed[observation[observation >= 0]] = row_of_node[observation >= 0]
     interval = observed
     if requested_times is not None:
-        candidates = np.flatnonzero(rank < _EVENT_AFTER)
+        candidates = np.flatnonzero(rank < EVENT_AFTER)
         interval = row_of_node[candidates[np.searchsorted(time[candidates], requested, side="right") - 1]]
     replicated = bool(np.mean(width == 0) >= _REPLICATED)
     return TimeGrid(intervals, lengths, observed, interval, requested, steps, np.asarray(origin), replicated,

@@ -26,13 +26,16 @@ from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.filter import FilterResult, filter_on
 from lfm_ppl.filtering.forward import forward
+from lfm_ppl.filtering.grid_layout import GridLayout
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_linear, is_observation_nonlinear
 from lfm_ppl.filtering.smoother import SmootherResult, smooth_on
-from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid, lay_out_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.events import EventTable, event_table
+from lfm_ppl.model.inputs import InputRead
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
@@ -59,12 +62,16 @@ class SeriesLikelihood(dist.Distribution):
     tolerance: float | None = None
     method: str = RUNGE_KUTTA
     sites: SiteSettings | None = None
+    layout: GridLayout | None = None
 
     def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None, steps: int) -> None:
         self.model, self.times, self.rule, self.steps = model, times, as_rule(rule), steps
-        model.check_at(self.time_grid.initial_time, np.shape(times)[0])
         concrete_times = checks.concrete(times)
-        if concrete_times is not None:
+        if concrete_times is None:
+            # The time grid of traced times may come from outside, by `with_times`.
+            model.check_at(times[0] if model.initial_time is None else model.initial_time, np.shape(times)[0])
+        else:
+            model.check_at(self._laid_out[0].grid.initial_time, len(concrete_times))
             model.check_span(float(concrete_times[0]), float(concrete_times[-1]))
         warn_single_precision()
         super().__init__((), (np.shape(times)[0], self.ssm.output_dim), validate_args=False)
@@ -78,8 +85,25 @@ class SeriesLikelihood(dist.Distribution):
     @functools.cached_property
     def time_grid(self) -> TimeGrid:
         """The time grid of the scan."""
-        return build_time_grid(self.ssm, self.times, self.steps, self.max_step,
-                               tolerance=self.tolerance)._replace(method=self.method)
+        if self.layout is not None:
+            return self.grid_of(self.layout)
+        layout, reads, events = self._laid_out
+        return layout.complete(reads, events)._replace(method=self.method)
+
+    @functools.cached_property
+    def _laid_out(self) -> tuple[GridLayout, list[InputRead], EventTable]:
+        return lay_out_time_grid(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
+
+    def lay_out(self, at: Any = None) -> GridLayout:
+        """Return the layout of the time grid with requested times (K,); None: the times of the data."""
+        if at is None:
+            return self._laid_out[0]
+        return lay_out_time_grid(self.ssm, self.times, self.steps, self.max_step, at, tolerance=self.tolerance)[0]
+
+    def grid_of(self, layout: GridLayout) -> TimeGrid:
+        """Return the time grid of a layout of this likelihood, for its parameters."""
+        reads = self.model.input_reads(0.0, 1.0) if any(layout.is_lagged + layout.is_event_lagged) else ()
+        return layout.complete(reads, event_table(self.model.events))._replace(method=self.method)
 
     # Not cached: it is computed from traced parameters, inside the function that `finite_or_minus_infinity` guards.
     @property
@@ -133,11 +157,12 @@ class SeriesLikelihood(dist.Distribution):
         """All constraints, and at how many times they hold; empty without constraints."""
         return ""
 
-    def with_times(self, times: Any) -> SeriesLikelihood:
-        """Return the same distribution with concrete times instead of traced ones."""
+    def with_times(self, times: Any, layout: GridLayout | None = None) -> SeriesLikelihood:
+        """Return the same distribution with other times, and with the layout of its time grid if that is known."""
         likelihood = copy.copy(self)
-        likelihood.__dict__.pop("time_grid", None)
-        likelihood.times = times
+        for name in ("time_grid", "_laid_out"):
+            likelihood.__dict__.pop(name, None)
+        likelihood.times, likelihood.layout = times, layout
         return likelihood
 
     def expand(self, batch_shape: tuple[int, ...]) -> dist.Distribution:
@@ -162,10 +187,19 @@ class SeriesLikelihood(dist.Distribution):
         """Smooth with this distribution's settings, or with other ``steps``; see `lfm_ppl.smooth`.
 
         Constraints are ignored.
+
+        Args:
+            y: (T, D), NaN where missing.
+            at: (K,) requested times, or the result of `lay_out` for them; None: the times of the data.
+            steps: integration steps between two consecutive times; None: those of the distribution.
         """
-        steps = self.steps if steps is None else steps
-        grid = build_time_grid(self.ssm, self.times, steps, self.max_step, at,
-                               tolerance=self.tolerance)._replace(method=self.method)
+        if at is None and steps is None:
+            grid = self.time_grid
+        elif isinstance(at, GridLayout):
+            grid = self.grid_of(at)
+        else:
+            grid = build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at,
+                                   tolerance=self.tolerance)._replace(method=self.method)
         y = self.checked(y)
         return smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
 

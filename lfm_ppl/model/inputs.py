@@ -118,22 +118,25 @@ class InputRead:
         xp = jnp if checks.traced((self.times, self.slope, self.offset)) else np
         return xp.maximum(xp.max(xp.abs(self.times)), xp.max(xp.abs(self.offset))) / xp.abs(self.slope)
 
-    def breakpoints(self) -> Any:
-        """Return the times of the model (K,) at which the input jumps or has a kink."""
-        times = self.times
+    @property
+    def breakpoint_rows(self) -> np.ndarray:
+        """Rows of the table at which the input jumps or has a kink; without known values all that may have one."""
+        count = np.shape(self.times)[0]
         values = None if self.values is None else checks.concrete(self.values)
-        if np.shape(times)[0] < 2:
-            return np.zeros(0)
-        if values is None or checks.traced(times):
-            times = times[1:] if self.interpolation == "previous" else times
-        elif self.interpolation == "previous":
-            times = times[1:][(np.diff(values, axis=0) != 0).reshape(len(times) - 1, -1).any(axis=1)]
-        else:
-            columns = values.reshape(len(times), -1)
-            slopes = np.pad(np.diff(columns, axis=0) / np.diff(times)[:, None], ((1, 1), (0, 0)))
-            rounding = _COLLINEAR * (np.abs(slopes[1:]) + np.abs(slopes[:-1]))
-            times = times[(np.abs(np.diff(slopes, axis=0)) > rounding).any(axis=1)]
-        return (times - self.offset) / self.slope
+        if count < 2:
+            return np.arange(0)
+        if values is None or checks.traced(self.times):
+            return np.arange(1 if self.interpolation == "previous" else 0, count)
+        if self.interpolation == "previous":
+            return 1 + np.flatnonzero((np.diff(values, axis=0) != 0).reshape(count - 1, -1).any(axis=1))
+        columns = values.reshape(count, -1)
+        slopes = np.pad(np.diff(columns, axis=0) / np.diff(self.times)[:, None], ((1, 1), (0, 0)))
+        rounding = _COLLINEAR * (np.abs(slopes[1:]) + np.abs(slopes[:-1]))
+        return np.flatnonzero((np.abs(np.diff(slopes, axis=0)) > rounding).any(axis=1))
+
+    def breakpoints(self, rows: Any = None) -> Any:
+        """Return the times of the model (K,) at which it reads rows of the table; None: `breakpoint_rows`."""
+        return (self.times[self.breakpoint_rows if rows is None else rows] - self.offset) / self.slope
 
 
 def input_reads(functions: Sequence[TracedFunction], first: float, last: float) -> list[InputRead]:
