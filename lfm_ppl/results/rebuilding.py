@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -60,16 +62,33 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
     Raises:
         ValueError: the result holds no posterior or no data; or the model is not the one that it was made with: other
             settings, other parameters.
+        TypeError: the model needs a keyword argument; the message names it.
     """
     posterior = arviz_data.group(result, "posterior")
     attrs = arviz_data.attributes(result)
     if times is None or y is None:
         stored = observations(result)
         times, y = stored[0] if times is None else times, stored[1] if y is None else y
-    bound = bind(numpyro_model, times, y, **inputs.keywords(result, model_kwargs))
+    arguments = inputs.keywords(result, model_kwargs)
+    try:
+        bound = bind(numpyro_model, times, y, **arguments)
+    except (TypeError, AttributeError) as error:
+        missing = _missing_keywords(numpyro_model, arguments)
+        if not missing or not re.search("NoneType|required", str(error)):
+            raise
+        example = ", ".join(f"{name!r}: ..." for name in missing)
+        raise TypeError(f"the model needs {', '.join(missing)}: pass model_kwargs={{{example}}}.") from error
     _check_settings(bound.site, attrs)
     bound = bound.fix(json.loads(attrs.get("fixed") or "{}"))
     return LikelihoodProblem(bound, _latent(bound, posterior))
+
+
+def _missing_keywords(numpyro_model: Callable, arguments: Mapping[str, Any]) -> list[str]:
+    """Return the names of keyword arguments that the model has no value of."""
+    parameters = list(inspect.signature(numpyro_model).parameters.values())[2:]
+    return [parameter.name for parameter in parameters if parameter.name not in arguments
+            and parameter.kind is not parameter.VAR_KEYWORD
+            and (parameter.default is None or parameter.default is parameter.empty)]
 
 
 def check_likelihood(result: Any, log_likelihood: np.ndarray, draw_index: np.ndarray) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.posterior import noise_of_rows
 from lfm_ppl.io.data_set import Data, at_origin, model_keywords
 from lfm_ppl.utils import calendar_time, checks
 
@@ -85,3 +86,12 @@ def check_requested_times(bound: BoundModel, times: Any, name: str = "at") -> No
             build_time_grid(example.ssm, data_times, example.steps, None, row, tolerance=example.tolerance)
         except ValueError as error:
             raise ValueError(f"series {series}: {error}") from None
+
+
+def warn_of_missing_predictions(bound: BoundModel, times: Any) -> None:
+    """Warn where new observations at the times of the trajectories have no distribution."""
+    if times is None or np.array_equal(np.asarray(times, float), bound.times) or not noise_of_rows(bound.site.example):
+        return
+    checks.warn("at: the noise is given for each row of the data, so that new observations at these times cannot be "
+                "predicted; the result has trajectories there, and no group `predictions`. For predictions give a "
+                "function (x, u, t) or one number for all rows as covariance.")

@@ -44,7 +44,7 @@ from lfm_ppl.results.series import SERIES
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import waiting
 from lfm_ppl.utils.types import Result, Times
-from lfm_ppl.workflows.data_binding import bind_dates, check_requested_times
+from lfm_ppl.workflows.data_binding import bind_dates, check_requested_times, warn_of_missing_predictions
 from lfm_ppl.workflows.fit_options import (
     FitOptions,
     check_sizes,
@@ -124,7 +124,8 @@ def fit(
             observation are forecasts, see `forecast`. (B, K) for series that have their own times. Dates where the
             times of the data are dates; numbers are in the unit of the `lfm.Data`, or else of the model.
         trajectory_draws: number of posterior draws, spread over the chains, that get a trajectory; 0: none.
-        model_kwargs: keyword arguments of the model.
+        model_kwargs: keyword arguments of the model. A second fit of the model to other data, times, known inputs and
+            real arrays of the same shapes compiles nothing, with the exceptions of `lfm.bind`.
         fixed: fixed parameters: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
         init: starting points. By default, or with "map", draws about the posterior mode. For NUTS they come from the
             Laplace approximation N(mode, C) widened to twice its standard deviations. C, the inverse Hessian, is the
@@ -185,7 +186,8 @@ def fit(
         KeyboardInterrupt: Ctrl-C before the first draw, without a checkpoint, or for the second time.
 
     Warns:
-        UserWarning: the result is partial.
+        UserWarning: the result is partial; new observations ``at`` these times cannot be predicted, because their
+            noise is given row by row.
         ConvergenceWarning: R-hat above 1.01, fewer than 100 effective draws a chain, divergences, a degenerate
             posterior mode; each with a remedy.
         ApproximationWarning: more iterations, shorter steps or a smaller ``max_step`` would change the posterior.
@@ -229,6 +231,7 @@ def fit(
         at = np.asarray(at, float) * (calendar_time.SECONDS[unit] / calendar_time.SECONDS[clock[1]])
     with calendar_time.in_messages(*clock):
         check_requested_times(bound, at)
+        warn_of_missing_predictions(bound, at)
     labels = Labels.of(bound, dims, coords, y)
     truth = checked_truth(bound, truth, labels)
     digest = None if checkpoint is None else model_digest(bound)

@@ -66,7 +66,7 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
         ValueError: times that go back or lie before the initial time; another model than that of the result, seen by
             its settings, its parameters or its log likelihood at the draws; a known input that ends before ``times``;
             noise whose covariance is given row by row.
-        TypeError: ``result`` is no ArviZ object.
+        TypeError: ``result`` is no ArviZ object; the model needs a keyword argument.
 
     Example:
         >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm

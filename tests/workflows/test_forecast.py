@@ -191,6 +191,25 @@ def test_a_known_input_must_reach_the_forecast():
 
 
 @pytest.mark.slow
+def test_noise_of_rows_and_a_missing_keyword_are_named():
+    def model(times, y=None, variances=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        system = lfm.LatentForceModel(
+            lambda x, u, t: 0.0 * x, {}, lfm.GaussianObservation(lambda x, u, t: x, variances + 0.01 * jnp.eye(1)),
+            lfm.Gaussian(jnp.reshape(level, (1,)), jnp.eye(1)))
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+    times, keywords = np.arange(4.0), {"variances": np.full((4, 1, 1), 0.1)}
+    with pytest.warns(UserWarning, match="cannot be predicted"):
+        result = lfm.fit(model, times, np.ones((4, 1)), sampler="map", samples=10, trajectory_draws=0, progress=False,
+                         model_kwargs=keywords, at=[5.0])
+    for given, error, message in ((None, TypeError, r"needs variances: pass model_kwargs=\{'variances': ...\}"),
+                                  (keywords, ValueError, "for each row"),
+                                  ({"variances": np.ones((2, 1, 1))}, ValueError, "2 matrices.* 4 times")):
+        with pytest.raises(error, match=message):
+            lfm.forecast(result, model, [5.0], model_kwargs=given, progress=False)
+
+
 def test_a_panel_is_forecast_series_by_series():
     def model(times, y=None):
         decay = numpyro.sample("decay", dist.LogNormal(jnp.log(jnp.array([0.5, 1.2])), NEAR).to_event(1))
