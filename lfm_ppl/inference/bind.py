@@ -24,12 +24,16 @@ def bind(model: Callable, times: ArrayLike, y: ArrayLike, **keywords: Any) -> Bo
             obs=y)``, or a `lfm_ppl.panel` in a plate.
         times: (T,), or (B, T) for a panel.
         y: (T, D), or (B, T, D) for a panel; NaN where missing. A tracer within compiled code.
-        **keywords: further arguments of the model; they decide what is compiled.
+        **keywords: further arguments of the model. Arrays of real numbers, such as known inputs, doses and covariances
+            of rows, are arguments of the compiled functions; other values decide what is compiled.
 
     Returns:
         The bound model, with ``log_density``, ``log_density_gradient``, ``constrain``, ``unconstrain``, ``names``,
-        ``filter`` and ``smooth``. The same model function with equal times, keywords and shape of data is not compiled
-        again, unless a global or closure variable that it reads has changed.
+        ``filter`` and ``smooth``. The same model function is not compiled again for other data, times and arrays of the
+        same shapes, unless a global or closure variable that it reads has changed, or the time grid has another size
+        (other numbers of breakpoints and doses between observations, of intervals in a long gap, of equal intervals).
+        A model that needs the values of times or arrays, such as ``if times[-1] > 1``, is compiled for these values,
+        and so is one with a panel or constraints.
 
     Raises:
         ValueError, TypeError: wrong shapes, traced times, a discrete parameter or none at all, no or

@@ -2,7 +2,8 @@
 
 1. `bind` checks times and data and looks up the `TracedModel` of the model function.
 2. Methods of `BoundModel` compile a function of z and y when first called, and keep it in the traced model.
-3. Data are an argument of each function, so that data sets of one shape share it.
+3. Data are an argument of each function, so that data sets of one shape share it. Times, known inputs and other real
+   arrays are arguments of each `program`, so that all models of one structure share it (`TracedModel.share_programs`).
 4. A model that needs the values of its data gets None as argument: its data are constants of the program.
 """
 
@@ -23,11 +24,12 @@ from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood
+from lfm_ppl.inference.model_arguments import ModelArguments, signature
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
-from lfm_ppl.inference.traced_model import TracedModel, signature
+from lfm_ppl.inference.traced_model import TracedModel
 from lfm_ppl.utils import checks
 
 FORWARD_MODE_LIMIT = 10
@@ -44,8 +46,8 @@ class BoundModel:
 
         log_density(z) = log p(y | T(z)) + log p(T(z)) + log |dT/dz|.
 
-    Times are constants of the compiled functions; data are an argument, so that another data set of the same shape
-    compiles nothing, and many data sets are a `jax.vmap`. Made by `lfm_ppl.bind`.
+    Data, times and inputs are arguments of the compiled functions, so that another data set of the same shape compiles
+    nothing, and many data sets are a `jax.vmap`. Made by `lfm_ppl.bind`.
 
     Every method of z and y can be traced (``jax.jit``, ``jax.grad``, ``jax.vmap``); z is a vector (d,) in the order of
     ``names``, and ``y`` defaults to the bound data.
@@ -132,6 +134,8 @@ class BoundModel:
         Raises:
             ValueError: another shape, an infinite entry; the model needs the values of its data.
         """
+        if isinstance(y, ModelArguments):
+            return y.data
         if y is None or y is self.y:
             return self.y
         if self.traced.data_index is None:
@@ -151,12 +155,17 @@ class BoundModel:
 
     @property
     def argument(self) -> Any:
-        """The data argument of compiled functions: the data, or None where they are constants of the program."""
+        """The argument of functions `compiled` for these times: the data, or None where they are constants."""
         return None if self.traced.data_index is None else self.y
 
-    def _argument(self, y: Any) -> Any:
-        data = self.data(y)  # raises an error where the data are constants and others are given
-        return None if self.traced.data_index is None else data
+    @property
+    def arguments(self) -> Any:
+        """The argument of each `program`: data, times and inputs; None where they are constants of the program."""
+        return self.traced.program_arguments(self.y)
+
+    def _arguments(self, y: Any) -> Any:
+        # `data` raises an error where the data are constants and others are given.
+        return y if isinstance(y, ModelArguments) else self.traced.program_arguments(self.data(y))
 
     def _position(self, z: Any) -> jax.Array:
         if np.shape(z) != (self.size,):
@@ -173,18 +182,18 @@ class BoundModel:
             z: (d,).
             y: data of the shape that was bound; None: the bound data.
         """
-        traced = self.traced
-        run = traced.memoized("log density", lambda: jax.jit(lambda z, y: -traced.potential(z, y)))
-        return run(self._position(z), self._argument(y))
+        run = self.program("log density", lambda: jax.jit(self._target(True)))
+        return run(self._position(z), self._arguments(y))
 
     def log_density_gradient(self, z: ArrayLike, y: ArrayLike | None = None) -> tuple[jax.Array, jax.Array]:
         """Return the log density and its gradient (d,); arguments as `log_density`."""
-        return self.gradient(self.forward_mode)(self._position(z), self._argument(y))
+        return self.gradient(self.forward_mode)(self._position(z), y)
 
     def gradient(self, forward_mode: bool, jacobian: bool = True) -> Any:
         """Return the compiled function from z and y to the log density and its gradient, by either mode."""
-        return self.compiled(("gradient", jacobian, forward_mode),
-                             lambda: jax.jit(value_and_gradient(self._target(jacobian), forward_mode)))
+        run = self.program(("gradient", jacobian, forward_mode),
+                           lambda: jax.jit(value_and_gradient(self._target(jacobian), forward_mode)))
+        return lambda z, y: run(z, self._arguments(y))
 
     def log_likelihood(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
         """Return log p(y | T(z)), summed over the series of a panel; arguments as `log_density`."""
@@ -192,15 +201,15 @@ class BoundModel:
             site = self._site_at(z, y)
             return site.distribution.log_prob(site.observed).sum()
 
-        run = self.compiled("log likelihood", lambda: jax.jit(log_likelihood))
-        return run(self._position(z), self._argument(y))
+        run = self.program("log likelihood", lambda: jax.jit(log_likelihood))
+        return run(self._position(z), self._arguments(y))
 
     def log_prior(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
         """Return the log prior density of the unconstrained parameters, Jacobian included."""
         traced = self.traced
-        run = traced.memoized("log prior", lambda: jax.jit(
+        run = self.program("log prior", lambda: jax.jit(
             lambda z, y: -traced.potential(z, y, remove_likelihood)))
-        return run(self._position(z), self._argument(y))
+        return run(self._position(z), self._arguments(y))
 
     def site_log_priors(self, values: Mapping[str, Any], y: Any = None) -> dict[str, jax.Array]:
         """Return the log prior density of each site, conditional on the sites that it depends on.
@@ -209,7 +218,7 @@ class BoundModel:
             values: site name -> value.
             y: as in `log_density`.
         """
-        trace = self.traced.trace_at(values, self.data(y))
+        trace = self.traced.trace_at(values, self._data_or_arguments(y))
         densities = {name: trace[name]["fn"].log_prob(trace[name]["value"]).sum() for name in self.sites}
         return {name: density if (scale := trace[name]["scale"]) is None else scale * density
                 for name, density in densities.items()}
@@ -228,17 +237,17 @@ class BoundModel:
         density_and_gradient = self.gradient(is_forward, jacobian)
 
         def minus(z: Any) -> tuple[Any, Any]:
-            value, gradient = density_and_gradient(jnp.asarray(z, float), self.argument)
+            value, gradient = density_and_gradient(jnp.asarray(z, float), self.y)
             return -value, -gradient
 
         if not exact_hessian:
             return Objective(minus)
         first_derivative = jax.jacfwd if is_forward else jax.jacrev
-        hessian = self.compiled(("hessian", jacobian, is_forward),
-                                lambda: jax.jit(jax.jacfwd(first_derivative(self._target(jacobian)))))
+        hessian = self.program(("hessian", jacobian, is_forward),
+                               lambda: jax.jit(jax.jacfwd(first_derivative(self._target(jacobian)))))
 
         def minus_hessian(z: Any) -> Any:
-            return -hessian(jnp.asarray(z, float), self.argument)
+            return -hessian(jnp.asarray(z, float), self.arguments)
 
         return Objective(minus, minus_hessian)
 
@@ -268,14 +277,14 @@ class BoundModel:
 
     def constrain(self, z: ArrayLike, y: ArrayLike | None = None) -> dict[str, jax.Array]:
         """Return site name -> value of the latent and the deterministic sites at z (d,)."""
-        run = self.traced.memoized("constrain", lambda: jax.jit(self.traced.constrain))
-        return run(self._position(z), self._argument(y))
+        run = self.program("constrain", lambda: jax.jit(self.traced.constrain))
+        return run(self._position(z), self._arguments(y))
 
     def constrain_draws(self, z: ArrayLike) -> dict[str, np.ndarray]:
         """Return site name -> values (..., *shape) at draws z (..., d)."""
         traced = self.traced
-        run = traced.memoized("constrain draws", lambda: jax.jit(jax.vmap(traced.constrain, in_axes=(0, None))))
-        values = run(jnp.asarray(z, float).reshape(-1, self.size), self.argument)
+        run = self.program("constrain draws", lambda: jax.jit(jax.vmap(traced.constrain, in_axes=(0, None))))
+        values = run(jnp.asarray(z, float).reshape(-1, self.size), self.arguments)
         return {name: np.asarray(value).reshape(*np.shape(z)[:-1], *value.shape[1:]) for name, value in values.items()}
 
     def unconstrain(self, values: Mapping[str, Any]) -> jax.Array:
@@ -348,17 +357,17 @@ class BoundModel:
             z: (d,), or site name -> value.
             y: as in `log_density`; the likelihood itself does not hold data.
         """
-        return self._site_at(z, self.data(y)).distribution
+        return self._site_at(z, self._data_or_arguments(y)).distribution
+
+    def _data_or_arguments(self, y: Any) -> Any:
+        return y if isinstance(y, ModelArguments) else self.data(y)
 
     def _site_at(self, z: Any, y: Any) -> LikelihoodSite:
         """Return the likelihood site at parameters, with its observations."""
         traced = self.traced
         values = z if isinstance(z, Mapping) else traced.constrain(jnp.asarray(z, float), y)
         values = {name: values[name] for name in self.sites if name in values}
-        site = likelihood_site(traced.model, traced.call(y), traced.keywords, traced.key, values)
-        if traced.constant_times is not None and checks.traced(site.distribution.times):
-            site = site._replace(distribution=site.distribution.with_times(traced.constant_times))
-        return site
+        return likelihood_site(traced.with_times(y), *traced.call(y), traced.key, values)
 
     def filter(self, z: ArrayLike | Mapping[str, Any], y: ArrayLike | None = None) -> FilterResult:
         """Return the result of the Gaussian filter at parameters z (d,), or site name -> value; see `lfm_ppl.filter`.
@@ -372,7 +381,7 @@ class BoundModel:
             site = self._site_at(z, y)
             return site.distribution.filter(site.observed)
 
-        return self.compiled("filter", lambda: eqx.filter_jit(run))(_as_arrays(z), self._argument(y))
+        return self.program("filter", lambda: eqx.filter_jit(run))(_as_arrays(z), self._arguments(y))
 
     def smooth(self, z: ArrayLike | Mapping[str, Any], at: ArrayLike | None = None,
                y: ArrayLike | None = None) -> SmootherResult:
@@ -394,8 +403,11 @@ class BoundModel:
             site = self._site_at(z, y)
             return site.distribution.smooth(site.observed, times)
 
+        if times is None:
+            return self.program("smooth", lambda: eqx.filter_jit(run))(_as_arrays(z), self._arguments(y))
+        data = self.data(y)
         return self.compiled(("smooth", signature(times)), lambda: eqx.filter_jit(run))(
-            _as_arrays(z), self._argument(y))
+            _as_arrays(z), None if self.argument is None else data)
 
     def _check_single(self, name: str) -> None:
         if isinstance(self.site.distribution, Panel):
@@ -418,21 +430,31 @@ class BoundModel:
         traced = self.traced
 
         def trace_modified() -> TracedModel:
-            return TracedModel(modify(traced.model), traced.arguments, traced.data_index, traced.keywords, self.y,
-                               traced.caller)
+            modified = TracedModel(modify(traced.model), traced.arguments, traced.data_index, traced.keywords, self.y,
+                                   traced.caller)
+            return modified.share_programs(traced.identity and (traced.identity, name)) if is_cached else modified
 
         with jax.ensure_compile_time_eval():  # the call may come from compiled code
             is_cached = name[1] is not None and not checks.traced(self.y)
             return BoundModel(traced.memoized(name, trace_modified) if is_cached else trace_modified(), self.y)
 
     def compiled(self, name: Hashable, make: Callable[[], Callable]) -> Callable:
-        """Return the function of this name, for any data; made at the first call.
+        """Return the function of this name, for any data, made at the first call for these times and inputs.
 
         Args:
             name: everything that the function depends on besides the model and its arguments.
             make: returns the function; the data must be an argument of it.
         """
         return self.traced.memoized(name, make)
+
+    def program(self, name: Hashable, make: Callable[[], Any]) -> Any:
+        """Return the function of this name, for any data, times and inputs; made at the first call.
+
+        Args:
+            name: everything that the function depends on besides the model and its arguments.
+            make: returns the function, which takes `arguments` and takes data, times and inputs from there only.
+        """
+        return self.traced.program(name, make)
 
 
 def _as_arrays(z: Any) -> Any:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 from numpyro import handlers
 
+from lfm_ppl.filtering.grid_layout import GridLayout
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
@@ -72,21 +73,38 @@ def single_site(sites: list[LikelihoodSite]) -> LikelihoodSite:
     return sites[0]
 
 
+class SiteTimes(NamedTuple):
+    """Times of a likelihood site that do not depend on the parameters.
+
+    Attributes:
+        times: (T,), or (B, T) for a panel.
+        layout: layout of the time grid; None where the likelihood lays it out itself.
+    """
+
+    times: Any
+    layout: GridLayout | None = None
+
+
 class replace_times(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
-    """Effect handler that gives the likelihood concrete times where the model's arithmetic made them tracers.
+    """Effect handler that gives each likelihood its times, where the model's arithmetic or compiled code traces them.
 
     Args:
         fn: a NumPyro model.
-        times: concrete times of the likelihood.
+        times: name of a site -> its times.
     """
 
-    def __init__(self, fn: Callable[..., Any], times: Any) -> None:
+    def __init__(self, fn: Callable[..., Any], times: Mapping[str, SiteTimes]) -> None:
         self.times = times
         super().__init__(fn)
 
     def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
-        """Return the likelihood at the concrete times."""
-        return likelihood.with_times(self.times) if checks.traced(likelihood.times) else likelihood
+        """Return the likelihood at these times."""
+        new: SiteTimes | None = self.times.get(site["name"])
+        if new is None:
+            return likelihood
+        if new.layout is not None and isinstance(likelihood, SeriesLikelihood):
+            return likelihood.with_times(new.times, new.layout)
+        return likelihood.with_times(new.times) if checks.traced(likelihood.times) else likelihood
 
 
 class remove_likelihood(LikelihoodHandler):  # noqa: N801 (an effect handler, see above)
@@ -97,12 +115,15 @@ class remove_likelihood(LikelihoodHandler):  # noqa: N801 (an effect handler, se
         return "the likelihood is inside a mask or an expansion, so that it cannot be separated from the prior."
 
 
-class record_times(LikelihoodHandler):  # noqa: N801 (an effect handler, see above)
-    """Effect handler that removes the likelihood and stores its times in ``times``."""
+class record_likelihoods(LikelihoodHandler):  # noqa: N801 (an effect handler, see above)
+    """Effect handler that removes each likelihood and stores it in ``likelihoods`` by the name of its site."""
 
-    times: Any = None
+    def begin(self) -> None:
+        """Forget the likelihoods of the run before."""
+        super().begin()
+        self.likelihoods: dict[str, SeriesLikelihood | Panel] = {}
 
     def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
-        """Store the times of the likelihood and return an improper distribution."""
-        self.times = likelihood.times
+        """Store the likelihood and return an improper distribution."""
+        self.likelihoods[site["name"]] = likelihood
         return super().replacement(likelihood, site)

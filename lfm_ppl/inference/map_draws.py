@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 import jax
@@ -57,15 +58,30 @@ def map_series(distribution: SeriesLikelihood | Panel, function: Callable, *argu
     return function(distribution, *arguments)
 
 
-def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, *,
-              rows: int | None = None, report: Reporter | None = None, store: BatchStore | None = None) -> Any:
+@dataclass(frozen=True)
+class SharedFunction:
+    """A function of draws that is compiled once for all times and inputs of a model.
+
+    Attributes:
+        per_draw: maps site values, a random key, the model's ``arguments`` and further arguments to a pytree of arrays.
+        arguments: the further arguments, pytrees of arrays that depend on times and inputs.
+    """
+
+    per_draw: Callable
+    arguments: tuple = ()
+
+
+def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable | SharedFunction, draws: Mapping[str, Any],
+              key: jax.Array, *, rows: int | None = None, report: Reporter | None = None,
+              store: BatchStore | None = None) -> Any:
     """Return ``per_draw(values, key, y)`` for all draws (S, ...).
 
     Args:
         bound: the model and its data y.
         name: name of the computation, or a tuple of it and all that ``per_draw`` depends on besides the model: the key
             of the compiled function.
-        per_draw: maps site values, a random key and the model's ``argument`` to a pytree of arrays.
+        per_draw: maps site values, a random key and the model's ``argument`` to a pytree of arrays, and is compiled for
+            the times and inputs of the model; or a `SharedFunction`.
         draws: site name -> (S, ...).
         key: a JAX random key.
         rows: rows of the scan over time, which decide the size of a batch; None: one draw after another.
@@ -78,28 +94,33 @@ def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable, draws: M
     is_vectorized = rows is not None and (example.tolerance is None or example.ssm.time_invariant)
     batch, parallel = _batch_size(count, rows, example.ssm.state_dim, is_vectorized)
 
-    def sequential(draws: Any, keys: jax.Array, y: Any) -> Any:
-        return jax.lax.map(lambda pair: per_draw(*pair, y), (draws, keys))
+    def sequential(draws: Any, keys: jax.Array, *arguments: Any) -> Any:
+        return jax.lax.map(lambda pair: function(*pair, *arguments), (draws, keys))
 
-    def by_fours(draws: Any, keys: jax.Array, y: Any) -> Any:
-        return mapped(lambda draw, key: per_draw(draw, key, y), draws, keys, batch_size=BATCH_SIZE)
+    def by_fours(draws: Any, keys: jax.Array, *arguments: Any) -> Any:
+        return mapped(lambda draw, key: function(draw, key, *arguments), draws, keys, batch_size=BATCH_SIZE)
 
-    run = bound.compiled(("map draws", is_vectorized, name), lambda: jax.jit(by_fours if is_vectorized else sequential))
+    if isinstance(per_draw, SharedFunction):
+        function, find = per_draw.per_draw, bound.program
+        arguments = bound.arguments, *per_draw.arguments
+    else:
+        function, find, arguments = per_draw, bound.compiled, (bound.argument,)
+    run = find(("map draws", is_vectorized, name), lambda: jax.jit(by_fours if is_vectorized else sequential))
     keys = split_keys(key, count)
 
-    def batch_arguments(start: int) -> tuple[dict[str, np.ndarray], jax.Array, Any]:
+    def batch_arguments(start: int) -> tuple[dict[str, np.ndarray], jax.Array, *tuple[Any, ...]]:
         index = np.minimum(np.arange(start, start + batch), count - 1)  # full batches: one shape
-        return {site: value[index] for site, value in draws.items()}, keys(index), bound.argument
+        return {site: value[index] for site, value in draws.items()}, keys(index), *arguments
 
     starts = range(0, count, batch)
     stored = {start: None if store is None else store.get(start) for start in starts}
     # Stored batches of another size cannot be used.
     results = {start: part for start, part in stored.items()
                if part is not None and len(jax.tree.leaves(part)[0]) == batch}
-    arguments = [batch_arguments(start) for start in starts if start not in results]
-    if len(arguments) > 1 and parallel > 1:
-        run = cast(Any, run).lower(*arguments[0]).compile()
-    computed = side_by_side(lambda *batch: jax.tree.map(np.asarray, run(*batch)), arguments, parallel)
+    batches = [batch_arguments(start) for start in starts if start not in results]
+    if len(batches) > 1 and parallel > 1:
+        run = cast(Any, run).lower(*batches[0]).compile()
+    computed = side_by_side(lambda *batch: jax.tree.map(np.asarray, run(*batch)), batches, parallel)
     label = name if isinstance(name, str) else name[0]
     with contextlib.closing(computed) as new, Progress(report, count, "draws", label) as progress:
         progress.start()

@@ -37,21 +37,27 @@ def model_digest(bound: BoundModel) -> str | None:
     medians = jnp.asarray(bound.draw(jax.random.key(0)))
     times = np.unique(bound.times)
     selection = np.unique(np.linspace(0, len(times) - 1, _TIMES).round().astype(int))
-    recorder = _record_values(bound.model, jnp.asarray(times[selection]))
-
-    @jax.jit
-    def evaluate(z: jax.Array, y: Any) -> tuple[jax.Array, list[Any]]:
-        prior = potential_energy(recorder, bound.traced.call(y), bound.traced.keywords, bound.unravel(z))
-        return prior, recorder.values
-
+    evaluate, recorder = bound.program("digest", lambda: _digest_program(bound))
     digest = hashlib.sha256(repr((bound.names, bound.size)).encode())
     for z in (medians, medians + _SHIFT):
-        for leaf in jax.tree.leaves(evaluate(z, bound.argument)):
+        for leaf in jax.tree.leaves(evaluate(z, jnp.asarray(times[selection]), bound.arguments)):
             is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
             array = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
             digest.update(f"{array.shape}{array.dtype}".encode() + _rounded(array))
     digest.update(re.sub(r"0x[0-9a-f]+", "", recorder.settings).encode())  # addresses differ between processes
     return digest.hexdigest()
+
+
+def _digest_program(bound: BoundModel) -> tuple[Any, _record_values]:
+    """Return the compiled function from z, times and the model's arguments to the values, and its recorder."""
+    recorder = _record_values(bound.model)
+
+    def evaluate(z: jax.Array, times: jax.Array, arguments: Any) -> tuple[jax.Array, list[Any]]:
+        recorder.times = times
+        prior = potential_energy(recorder, *bound.traced.call(arguments), bound.unravel(z))
+        return prior, recorder.values
+
+    return jax.jit(evaluate), recorder
 
 
 def _rounded(array: np.ndarray) -> bytes:
@@ -71,12 +77,14 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
     """Effect handler that evaluates the functions of the likelihood's model instead of the filter.
 
     Attributes:
+        times: at which the functions are evaluated.
         values: arrays of the likelihood and values of its functions.
         settings: settings of the likelihood that are no arrays.
     """
 
-    def __init__(self, model: Any, times: jax.Array) -> None:
-        self.times = times
+    times: Any = None
+
+    def __init__(self, model: Any) -> None:
         self.values: list[Any] = []
         self.settings = ""
         super().__init__(model)

@@ -18,15 +18,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.filtering.grid_layout import GridLayout, padded_size
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import LONGEST_FORECAST, build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
-from lfm_ppl.inference.map_draws import BatchStore, map_draws, map_series
+from lfm_ppl.inference.map_draws import BatchStore, SharedFunction, map_draws, map_series
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS
+from lfm_ppl.inference.model_arguments import signature
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
-from lfm_ppl.inference.traced_model import signature
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.simulate import input_breakpoints, simulate_missing_states
@@ -76,8 +77,8 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *,
         log_priors = {LOG_PRIOR + name: value for name, value in bound.site_log_priors(values, y).items()}
         return map_series(bound.likelihood(values, y), score_series, bound.data(y)) | log_priors
 
-    return map_draws(bound, "scores", per_draw, draws, jax.random.key(0), rows=bound.times.size, report=report,
-                     store=store)
+    return map_draws(bound, "scores", SharedFunction(per_draw), draws, jax.random.key(0), rows=bound.times.size,
+                     report=report, store=store)
 
 
 def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
@@ -118,11 +119,17 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     is_forecast = None
     if particles is None and not isinstance(example, ConstrainedLikelihood) and example.ssm.drift_structure.nonlinear:
         is_forecast = _has_forecast(bound, at)
+    is_shared = particles is None and bound.traced.inputs is not None
+    count = None if at is None else at.shape[-1]
+    if at is not None and is_shared and not is_forecast:
+        # Repetitions of the last time, so that similar times share a program; their results are removed below.
+        extra = padded_size(at.size + bound.times.size) - at.size - bound.times.size
+        at = np.append(at, np.repeat(at[-1], extra))
     plan = _plan(bound, at, particles is not None or is_forecast is not None,
                  _first_simulated_times(bound) if is_forecast else np.full(bound.times.shape[:-1], -np.inf))
 
-    def draw_series(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array,
-                    path_times: Any = plan.times) -> dict[str, jax.Array]:
+    def draw_series(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array, path_times: Any = plan.times,
+                    layout: GridLayout | None = None) -> dict[str, jax.Array]:
         ssm = distribution.ssm
         path_key, noise_key = jax.random.split(key)
         results: dict[str, jax.Array] = {}
@@ -130,9 +137,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             smoothed = None
             w, when = distribution.feasible_path(path_key, y, path_times)
         elif particles is None:
-            # Where the path is simulated the smoother stays at the last row of the data, at no cost.
-            reached = path_times
-            if is_forecast and path_times is not None:
+            reached = layout or path_times
+            if layout is None and is_forecast and path_times is not None:
                 minimum = jnp.minimum if plan.is_of_series else np.minimum
                 reached = minimum(path_times, distribution.times[-1] if plan.is_of_series else bound.times.max())
             smoothed = distribution.smooth(y, reached, plan.smoother_steps)
@@ -190,10 +196,24 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         keys = jax.random.split(key, y.shape[0]) if isinstance(distribution, Panel) else key
         return map_series(distribution, draw_series, y, keys, *([plan.times] if plan.is_of_series else []))
 
-    rows = plan.rows
-    width = 1 if particles is None else particles.particles
-    name = ("trajectories", signature(at), particles, particle_steps, is_forecast)
-    return map_draws(bound, name, per_draw, draws, key, rows=rows * width, report=report, store=store)
+    def shared_per_draw(values: Any, key: jax.Array, y: Any, times: Any, inputs: Any) -> dict[str, jax.Array]:
+        distribution = bound.likelihood(values, y)
+        assert isinstance(distribution, SeriesLikelihood)
+        return draw_series(distribution, bound.data(y), key, times, None if inputs is None else inputs.value[1])
+
+    options: dict[str, Any] = {"report": report, "store": store}
+    name: tuple = ("trajectories", particles, particle_steps, is_forecast)
+    if is_shared:
+        # Where the path is simulated the smoother stays at the last row of the data, at no cost.
+        reached = plan.times if plan.times is None or not is_forecast else np.minimum(plan.times, bound.times.max())
+        inputs = None if reached is None else bound.traced.lay_out(reached)
+        name = (*name, len(plan.requested), plan.rows, at is None, plan.steps if is_forecast else None)
+        paths = map_draws(bound, name, SharedFunction(shared_per_draw, (plan.times, inputs)), draws, key,
+                          rows=plan.rows, **options)
+        return {name: value if name in ("y", "log_likelihood") else value[..., :count, :]
+                for name, value in paths.items()}
+    rows = plan.rows * (1 if particles is None else particles.particles)
+    return map_draws(bound, (*name, signature(at)), per_draw, draws, key, rows=rows, **options)
 
 
 def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Array,
@@ -318,7 +338,9 @@ def _simulate_forecast(distribution: SeriesLikelihood, states: jax.Array, when: 
     """Return the joint states (L, n), simulated after the last smoothed one; ``is_smoothed`` is (L,)."""
     order = jnp.arange(plan.rows) if plan.times is None else jnp.argsort(when, stable=True)
     # Breakpoints before the first time or after the last one change nothing.
-    breakpoints = input_breakpoints(distribution.model, None, None)
+    layout = distribution.layout
+    breakpoints = (input_breakpoints(distribution.model, None, None) if layout is None
+                   else layout.breakpoints(distribution.model.input_reads(0.0, 1.0)))
     path = simulate_missing_states(distribution.ssm, key, states[order], when[order], is_smoothed[order], plan.steps,
                                    breakpoints)
     return jnp.zeros_like(states).at[order].set(path)

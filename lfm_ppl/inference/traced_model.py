@@ -6,7 +6,10 @@
 3. Decide whether the likelihood's times are constant. Arithmetic on constants gives tracers inside `jax.jit`; the
    constant times of step 1 then replace them. Times that depend on parameters or data stay traced.
 4. Keep the compiled functions by name. Data are an argument of each, so that all data sets of one shape share them.
-5. Keep the latest models (`traced_model`), by the identity of the model function, its other arguments, the shapes of
+5. Run the model with abstract times and arrays, too. Where that works, they become arguments of programs, with the time
+   grids that were laid out for their values; models of one structure share these programs (`share_programs`). Where it
+   fails, programs are compiled for the values.
+6. Keep the latest models (`traced_model`), by the identity of the model function, its other arguments, the shapes of
    the data and the variables that the function reads.
 
 `jax.jit` does the caching by shapes and dtypes.
@@ -33,16 +36,19 @@ from numpyro.infer.util import log_density as constrained_log_density
 
 from lfm_ppl.inference.likelihood_site import (
     LikelihoodSite,
+    SiteTimes,
     likelihood_sites,
-    record_times,
+    record_likelihoods,
     replace_times,
     single_site,
 )
+from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.inference.model_arguments import ModelArguments, ModelInputs, shapes, signature
 from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, latent_sites
 from lfm_ppl.utils import checks
 
-_CACHED_MODELS = 8
-"""Models whose compiled functions are kept for the next data set."""
+_CACHED_MODELS, _CACHED_PROGRAMS = 8, 32
+"""Models that are kept for the next data set, and structures of models whose compiled functions are kept."""
 
 _SITEWISE_STRATEGIES = (init_to_median, init_to_sample)
 """Initialisation strategies that depend on a site alone, so that they can be compiled."""
@@ -72,7 +78,10 @@ class TracedModel:
         names: names of the unconstrained coordinates.
         size: number of unconstrained coordinates d.
         sites_of_times: names of likelihood sites that observe the times instead of the data.
-        functions: name -> compiled function, or another object that depends on the model alone.
+        functions: name -> compiled function, or another object that depends on this model alone.
+        identity: key of the model function; None where its programs are not shared.
+        programs: name -> compiled function that models of one structure share, see `share_programs`.
+        inputs: arguments of these programs besides the data; None where they depend on the values of the arguments.
     """
 
     def __init__(self, model: Callable, arguments: tuple, data_index: int | None, keywords: Mapping[str, Any],
@@ -81,6 +90,10 @@ class TracedModel:
         self.key = jax.random.key(0)
         self.caller = caller
         self.functions: dict[Hashable, Any] = {}
+        self.programs = self.functions
+        self.identity: Hashable = None
+        self.inputs: ModelInputs | None = None
+        self._structures: list[Hashable] = []
         self._seeded = handlers.seed(model, self.key)
         trace = self._trace(data, self.key, init_to_median)
         likelihoods = likelihood_sites(trace)
@@ -94,16 +107,20 @@ class TracedModel:
         self.size = int(flat.size)
         self._example = data
 
-    def call(self, y: Any) -> tuple:
-        """Return the positional arguments with the data in their place."""
-        if self.data_index is None:
-            return self.arguments
-        return (*self.arguments[:self.data_index], y, *self.arguments[self.data_index + 1:])
+    def call(self, y: Any) -> tuple[tuple, dict[str, Any]]:
+        """Return the positional and keyword arguments for data or `ModelArguments`; the latter may be traced."""
+        arguments, keywords = self.arguments, self.keywords
+        if isinstance(y, ModelArguments):
+            y, (arguments, keywords) = y.data, y.inputs.value[0]
+        if self.data_index is not None:
+            arguments = (*arguments[:self.data_index], y, *arguments[self.data_index + 1:])
+        return arguments, keywords
 
     def _trace(self, y: Any, key: jax.Array, strategy: Callable) -> dict[str, Any]:
         seeded = handlers.substitute(handlers.seed(self.model, key), substitute_fn=strategy)
         try:
-            trace = handlers.trace(seeded).get_trace(*self.call(y), **self.keywords)
+            arguments, keywords = self.call(y)
+            trace = handlers.trace(seeded).get_trace(*arguments, **keywords)
         except AssertionError as error:
             if (duplicate := _DUPLICATE_NAME.search(str(error))) is None:
                 raise
@@ -113,31 +130,85 @@ class TracedModel:
         return trace
 
     @functools.cached_property
-    def constant_times(self) -> Any:
-        """The likelihood's times; None where they depend on parameters or data or there is no likelihood."""
-        recorder, data = record_times(self._seeded), self._example
-
-        def run(z: jax.Array, y: Any) -> jax.Array:
-            return potential_energy(recorder, self.call(y), self.keywords, self.unravel(z))
-
-        z = jnp.zeros(self.size)
-        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), data)
-        if self.data_index is None:
-            jax.eval_shape(lambda z: run(z, data), z)
-        else:
-            jax.eval_shape(run, z, shapes)
-        if len(self._likelihoods) != 1:
-            return None
-        if checks.traced(recorder.times):
+    def site_times(self) -> dict[str, SiteTimes]:
+        """The times of each likelihood by site, and their layouts, where they do not depend on parameters or data."""
+        data = self._example if self.data_index is not None else None
+        z, times = jnp.zeros(self.size), {}
+        recorded = self._recorded(_measure, self._seeded, jax.eval_shape, z, shapes(data))
+        if checks.traced([measured[:2] for measured in recorded.values()]):
             # In `jax.jvp`, unlike in `jax.jit`, only what depends on the inputs is traced.
             values = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype) if checks.traced(leaf) else leaf, data)
-            if self.data_index is None:
-                jax.jvp(lambda z: run(z, values), (z,), (z,))
-            else:
-                jax.jvp(run, (z, values), (z, jax.tree.map(jnp.zeros_like, values)))
-            if checks.traced(recorder.times):
-                return None
-        return self.site.distribution.times
+            recorded = self._recorded(_measure, self._seeded, _differentiate, z, values)
+        self._structures = [structure for _, _, structure in recorded.values()]
+        for site in self._likelihoods:
+            traced_times, layout, _ = recorded.get(site.name, (None, None, None))
+            if not checks.traced(traced_times):
+                times[site.name] = SiteTimes(site.distribution.times, None if checks.traced(layout) else layout)
+        return times
+
+    def _recorded(self, measure: Callable[[Any], Any], model: Callable, transformation: Callable,
+                  *arguments: Any) -> dict[str, Any]:
+        """Return what ``measure`` says of each likelihood in a transformed run of a model, by site.
+
+        Args:
+            measure: function of a likelihood.
+            model: this model, seeded.
+            transformation: such as `jax.eval_shape`, of a function of z and y.
+            *arguments: its further arguments, z (d,) and y.
+        """
+        recorder, results = record_likelihoods(model), {}
+
+        def run(z: jax.Array, y: Any) -> jax.Array:
+            if isinstance(y, ModelArguments):
+                recorder.fn = self.with_times(y)
+            density = potential_energy(recorder, *self.call(y), self.unravel(z))
+            results.update({name: measure(likelihood) for name, likelihood in recorder.likelihoods.items()})
+            return density
+
+        transformation(run, *arguments)
+        return results
+
+    def lay_out(self, at: np.ndarray) -> ModelInputs | None:
+        """Return the layout with requested times (K,), an argument of programs; None where programs need the times."""
+        if self.inputs is None or len(self._likelihoods) != 1:
+            return None
+        (layout,) = self._recorded(lambda likelihood: likelihood.lay_out(at), self.with_times(self._example),
+                                   jax.eval_shape, jnp.zeros(self.size), shapes(self._example)).values()
+        return ModelInputs.of((), layout.padded())
+
+    def share_programs(self, identity: Hashable) -> TracedModel:
+        """Make times, arrays among the arguments and time grids arguments of programs, if the model can be traced so.
+
+        Programs are then shared by all models of one identity, one structure and one shape of the arrays. Not where a
+        likelihood is a panel or has constraints, where its times depend on parameters, or where the structure of the
+        model depends on the values of its arguments.
+        """
+        layouts = [self.site_times.get(site.name, SiteTimes(None)).layout for site in self._likelihoods]
+        if self.data_index is None or identity is None or not layouts or any(layout is None for layout in layouts):
+            return self
+        inputs = ModelInputs.of((self.arguments, self.keywords), {
+            name: times._replace(layout=times.layout.padded()) for name, times in self.site_times.items()
+            if times.layout is not None})
+        arguments = shapes(ModelArguments(self._example, inputs))
+        leaves, structure = jax.tree.flatten(arguments)
+        key = identity, structure, *self._structures, *((leaf.shape, str(leaf.dtype)) for leaf in leaves)
+        if key not in _programs:
+            _programs[key] = {} if self._is_traceable(arguments) else None
+            if len(_programs) > _CACHED_PROGRAMS:
+                _programs.popitem(last=False)
+        _programs.move_to_end(key)
+        self.identity = identity
+        if (programs := _programs[key]) is not None:
+            self.programs, self.inputs = programs, inputs
+        return self
+
+    def _is_traceable(self, arguments: ModelArguments) -> bool:
+        """Return whether the model can be run with traced arguments, and has the same structure then."""
+        try:
+            traced = self._recorded(_traced_structure, self._seeded, jax.eval_shape, jnp.zeros(self.size), arguments)
+        except _TRACING_ERRORS:
+            return False
+        return list(traced.values()) == self._structures
 
     @property
     def site(self) -> LikelihoodSite:
@@ -150,9 +221,10 @@ class TracedModel:
 
     def trace_at(self, values: Mapping[str, Any], y: Any) -> dict[str, Any]:
         """Return NumPyro's trace of the model at values of its sites."""
-        substituted = handlers.substitute(self.with_constant_times(), data={
+        substituted = handlers.substitute(self.with_times(y), data={
             name: jnp.asarray(value, float) for name, value in values.items()})
-        return handlers.trace(substituted).get_trace(*self.call(y), **self.keywords)
+        arguments, keywords = self.call(y)
+        return handlers.trace(substituted).get_trace(*arguments, **keywords)
 
     def draw(self, y: Any, key: jax.Array, strategy: Callable) -> jax.Array:
         """Return unconstrained values of the latent sites, (d,), by a NumPyro initialisation strategy."""
@@ -162,7 +234,7 @@ class TracedModel:
         if strategy not in _SITEWISE_STRATEGIES or self.data_index is None or checks.traced(y):
             return run(key, y)
         # With many data sets of one shape, running the model in Python would take longer than everything else.
-        return self.memoized(("draw", strategy), lambda: jax.jit(run))(key, y)
+        return self.program(("draw", strategy), lambda: jax.jit(run))(key, self.program_arguments(y))
 
     def potential(self, z: jax.Array, y: Any, handler: Callable[[Callable], Callable] | None = None) -> Any:
         """Return minus the log density of the unconstrained parameters, Jacobian included.
@@ -172,28 +244,36 @@ class TracedModel:
             y: the data.
             handler: maps the model to one with another likelihood.
         """
-        model = self.with_constant_times()
-        return potential_energy(model if handler is None else handler(model), self.call(y), self.keywords,
-                                self.unravel(z))
+        model = self.with_times(y)
+        return potential_energy(model if handler is None else handler(model), *self.call(y), self.unravel(z))
 
     def constrained_potential(self, z: jax.Array, y: Any) -> jax.Array:
         """Return minus the log density of the constrained parameters, without the Jacobian."""
-        model = self.with_constant_times()
-        values = constrain_fn(model, self.call(y), self.keywords, self.unravel(z))
-        return -constrained_log_density(model, self.call(y), self.keywords, values)[0]
+        model = self.with_times(y)
+        values = constrain_fn(model, *self.call(y), self.unravel(z))
+        return -constrained_log_density(model, *self.call(y), values)[0]
 
     def constrain(self, z: jax.Array, y: Any) -> dict[str, jax.Array]:
         """Return the values of the latent and of the deterministic sites."""
-        return constrain_fn(self._seeded, self.call(y), self.keywords, self.unravel(z), return_deterministic=True)
+        return constrain_fn(self._seeded, *self.call(y), self.unravel(z), return_deterministic=True)
 
     def unconstrain(self, values: Mapping[str, Any], y: Any) -> tuple[jax.Array, dict[str, Any]]:
         """Return z (d,) at the values of the latent sites, and the trace of these sites."""
         trace = latent_sites(self.trace_at(values, y))
         return ravel_pytree(_unconstrained(trace))[0], trace
 
-    def with_constant_times(self) -> Callable:
-        """Return the seeded model, with concrete times where they are constant."""
-        return self._seeded if self.constant_times is None else replace_times(self._seeded, self.constant_times)
+    def with_times(self, y: Any) -> Callable:
+        """Return the seeded model with the times of its likelihoods: constants, or those of `ModelArguments`."""
+        if isinstance(y, ModelArguments):
+            return replace_times(self._seeded, y.inputs.value[1])
+        times = {name: SiteTimes(site_times.times) for name, site_times in self.site_times.items()}
+        return replace_times(self._seeded, times) if times else self._seeded
+
+    def program_arguments(self, y: Any) -> Any:
+        """Return the data with all that programs take as arguments; the data alone where they take nothing else."""
+        if self.data_index is None:
+            return None
+        return y if self.inputs is None or isinstance(y, ModelArguments) else ModelArguments(y, self.inputs)
 
     def memoized(self, name: Hashable, make: Callable[[], Any]) -> Any:
         """Return the object of this name, made by ``make`` at the first call."""
@@ -201,8 +281,41 @@ class TracedModel:
             self.functions[name] = make()
         return self.functions[name]
 
+    def program(self, name: Hashable, make: Callable[[], Any]) -> Any:
+        """Return the compiled function of this name of `program_arguments`, whatever their values."""
+        if name not in self.programs:
+            self.programs[name] = make()
+        return self.programs[name]
+
+
+def _measure(likelihood: Any) -> tuple[Any, Any, Hashable]:
+    """Return the times, and of a `MarginalLikelihood` the layout of its time grid and the structure of its model."""
+    if not isinstance(likelihood, MarginalLikelihood):
+        return likelihood.times, None, None
+    layout = None if checks.traced(likelihood.times) else likelihood.lay_out()
+    return likelihood.times, layout, _structure(likelihood)
+
+
+def _structure(likelihood: MarginalLikelihood) -> Hashable:
+    """Return what of a state-space model decides its program."""
+    leaves, tree = jax.tree.flatten(likelihood.ssm)
+    return tree, tuple(np.shape(leaf) for leaf in leaves)
+
+
+def _traced_structure(likelihood: MarginalLikelihood) -> Hashable:
+    """Return the same where times and inputs are traced; raise ValueError if its inputs are read in another way."""
+    _ = likelihood.time_grid
+    return _structure(likelihood)
+
+
+def _differentiate(run: Callable, z: jax.Array, y: Any) -> None:
+    """Run a function of z and y with tracers of `jax.jvp`."""
+    jax.jvp(run, (z, y), (z, jax.tree.map(jnp.zeros_like, y)))
+
 
 _models: OrderedDict[Hashable, TracedModel] = OrderedDict()
+_programs: OrderedDict[Hashable, dict[Hashable, Any] | None] = OrderedDict()
+"""Compiled functions by the identity and structure of a model; None where they need the values of its arguments."""
 
 
 def traced_model(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
@@ -225,51 +338,17 @@ def traced_model(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
             return _models[key], data
         try:
             traced = TracedModel(model, static, data_index, keywords, data, caller)
-            _ = traced.constant_times  # runs the model with tracers
+            _ = traced.site_times  # runs the model with tracers
         except _TRACING_ERRORS:
             # The model needs the values of its data; any other error is raised again.
             return TracedModel(model, arguments, None, keywords, data, caller), data
+        if is_cached:
+            traced.share_programs((model, signature(variables)))
     if is_cached:
         _models[key] = traced
         if len(_models) > _CACHED_MODELS:
             _models.popitem(last=False)
     return traced, data
-
-
-def signature(value: Any) -> Hashable:
-    """Return a hashable object that is equal for equal pytrees; None for a pytree with tracers.
-
-    Arrays are compared by shape, dtype and bytes, objects without a hash by identity.
-    """
-    leaves, structure = jax.tree.flatten(value)
-    if checks.traced(leaves):
-        return None
-    return structure, tuple(_leaf_signature(leaf) for leaf in leaves)
-
-
-def _leaf_signature(leaf: Any) -> Hashable:
-    if isinstance(leaf, (np.ndarray, np.generic, jax.Array)):
-        return np.shape(leaf), str(np.asarray(leaf).dtype), np.asarray(leaf).tobytes()
-    try:
-        hash(leaf)
-    except TypeError:
-        return _Identity(leaf)
-    return type(leaf), leaf
-
-
-class _Identity:
-    """Hash an object by its identity, and keep it alive so that its identity is not reused."""
-
-    def __init__(self, value: Any) -> None:
-        self.value = value
-
-    def __eq__(self, candidate: object) -> bool:
-        """Whether both refer to the same object."""
-        return isinstance(candidate, _Identity) and candidate.value is self.value
-
-    def __hash__(self) -> int:
-        """Return the hash of the identity."""
-        return id(self.value)
 
 
 def _variables(function: Callable) -> dict[str, Any]:

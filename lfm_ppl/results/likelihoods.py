@@ -24,7 +24,7 @@ from lfm_ppl.filtering.problem import filter_problem, is_linear, is_observation_
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.map_draws import BatchStore, map_draws, map_series
+from lfm_ppl.inference.map_draws import BatchStore, SharedFunction, map_draws, map_series
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import check_noise
@@ -139,8 +139,8 @@ def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods") -> np.nd
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
         return {"total": bound.likelihood(values, y).log_prob(bound.data(y)).sum()}
 
-    return map_draws(bound, "log likelihoods", per_draw, problem.draws, jax.random.key(0), rows=bound.times.size,
-                     store=problem.batch_store(name))["total"]
+    return map_draws(bound, "log likelihoods", SharedFunction(per_draw), problem.draws, jax.random.key(0),
+                     rows=bound.times.size, store=problem.batch_store(name))["total"]
 
 
 def recorded(problem: LikelihoodProblem, log_likelihoods: np.ndarray) -> np.ndarray:
@@ -155,8 +155,8 @@ def recorded(problem: LikelihoodProblem, log_likelihoods: np.ndarray) -> np.ndar
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
         return bound.likelihood(values, y).log_prob_per_observation(bound.data(y)).sum()
 
-    return map_draws(bound, "one step ahead", per_draw, problem.draws, jax.random.key(0), rows=bound.times.size,
-                     store=problem.batch_store("one-step-ahead terms"))
+    return map_draws(bound, "one step ahead", SharedFunction(per_draw), problem.draws, jax.random.key(0),
+                     rows=bound.times.size, store=problem.batch_store("one-step-ahead terms"))
 
 
 def finer_tolerance(tolerance: float) -> float:

@@ -177,8 +177,9 @@ def fit_many(
 ) -> ManyFits:
     """Fit a latent force model to each of many data sets.
 
-    Data sets with equal times and shapes share the compiled programs of `fit` in each process, and the processes of one
-    machine share a cache of compiled programs. The result of a data set is that of `fit` with the seed
+    Data sets of equal shapes share the compiled programs of `fit` in each process, with individual times, known inputs
+    and doses (`lfm.bind` names the exceptions), and the processes of one machine share a cache of compiled programs.
+    The result of a data set is that of `fit` with the seed
     ``seed_of(name, seed)``, for any other data sets and any number of workers.
 
     Args:
