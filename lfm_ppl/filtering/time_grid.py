@@ -155,7 +155,9 @@ def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_
                              "initial_time or `start`) that are known before compilation; pass NumPy arrays rather "
                              "than traced values, and do not convert them with jnp inside the model.")
         part = division.steps_per_interval(np.full(np.shape(times)[0], steps))
-        grid = _grid_from_traced_times(times, -(-steps // part), part, initial_time, requested_times)
+        pieces = -(-steps // part)
+        grid = (_grid_from_traced_times(times, pieces, part, initial_time) if requested_times is None
+                else _grid_from_traced_request(times, pieces, part, initial_time, requested_times))
     intervals = grid.intervals
     inner = inset(intervals.start, intervals.end, intervals.length, division.scale)
     return insert_traced_times(grid._replace(intervals=intervals._replace(inset=inner)), breakpoints, events,
@@ -242,20 +244,22 @@ def longest_step(ssm: StateSpaceModel, times: Any, origin: Any, steps: int) -> f
     return max(2.0 * float(np.median(gaps)), float(np.mean(gaps)) / _MOST_STEPS) / steps
 
 
-def _grid_from_traced_times(times: Any, pieces: int, steps: int, initial_time: Any,
-                            requested_times: Any = None) -> TimeGrid:
-    """Return ``pieces`` intervals of ``steps`` steps each between two times, requested ones included."""
+def _grid_from_traced_request(times: Any, pieces: int, steps: int, initial_time: Any, requested_times: Any) -> TimeGrid:
+    """Return ``pieces`` intervals of ``steps`` steps each between two observations or requested times."""
+    count = np.shape(times)[0]
+    nodes = jnp.concatenate([jnp.asarray(times, float), jnp.asarray(requested_times, float)])
+    order = jnp.argsort(nodes, stable=True)  # an observation comes before a request of the same time
+    grid = _grid_from_traced_times(nodes[order], pieces, steps, times[0] if initial_time is None else initial_time)
+    node = jnp.asarray(grid.intervals.observation)
+    observation = jnp.where((node >= 0) & (order[node] < count), order[node], -1)
+    last = jnp.asarray(grid.observed)[jnp.argsort(order)]
+    return grid._replace(intervals=grid.intervals._replace(observation=observation), observed=last[:count],
+                         requested=last[count:], requested_times=nodes[count:])
+
+
+def _grid_from_traced_times(times: Any, pieces: int, steps: int, initial_time: Any) -> TimeGrid:
+    """Return ``pieces`` intervals of ``steps`` steps each between two times."""
     times = jnp.asarray(times, float)
-    if requested_times is not None:
-        count = times.shape[0]
-        nodes = jnp.concatenate([times, jnp.asarray(requested_times, float)])
-        order = jnp.argsort(nodes, stable=True)  # an observation comes before a request of the same time
-        grid = _grid_from_traced_times(nodes[order], pieces, steps, times[0] if initial_time is None else initial_time)
-        last = jnp.asarray(grid.observed)[jnp.argsort(order)]
-        node = jnp.asarray(grid.intervals.observation)
-        observation = jnp.where((node >= 0) & (order[node] < count), order[node], -1)
-        return grid._replace(intervals=grid.intervals._replace(observation=observation), observed=last[:count],
-                             requested=last[count:], requested_times=nodes[count:])
     origin = times[:1] if initial_time is None else jnp.reshape(jnp.asarray(initial_time, float), (1,))
     start = jnp.concatenate([origin, times[:-1]])
     width = jnp.repeat((times - start) / pieces, pieces)
