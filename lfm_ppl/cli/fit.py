@@ -26,7 +26,7 @@ from lfm_ppl.cli.options import DataOptions, FitArguments
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.io import loading
-from lfm_ppl.io.data_set import Data, stack_series
+from lfm_ppl.io.data_set import OF_SERIES, Data, stack_series
 from lfm_ppl.io.truth import read_truth
 from lfm_ppl.results import arviz_data, checkpoint, files, html_report, tables
 from lfm_ppl.utils import calendar_time
@@ -125,7 +125,8 @@ def _print_data(options: FitArguments, model: loading.ModelFile, observed: Data,
     for name in (name for name, count in counts.items() if count == rows):
         print(f"note     {name} has no value: its own parameters follow the prior")
     if observed.inputs:
-        print("inputs   " + ", ".join(f"{name} ({table.interpolation})" for name, table in observed.inputs.items()))
+        ways = {name.partition(OF_SERIES)[0]: table.interpolation for name, table in observed.inputs.items()}
+        print("inputs   " + ", ".join(f"{name} ({way})" for name, way in ways.items()))
     if observed.origin is not None:
         print(f"time     in {observed.units['time']} since {observed.origin.replace('T', ' ')}")
     anchors = model.anchors(observed)
