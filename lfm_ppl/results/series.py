@@ -96,7 +96,8 @@ def select_series(result: Any, series: Any) -> Any:
     name = next(label for label in observed.data_vars if dimension in observed[label].dims and label != TIMES)
     is_observed = observed[name].notnull().any("output").transpose(dimension, "time").values
     has_scores = is_observed[index][is_observed.any(axis=0)]
-    is_later = np.diff(_select(observed, dimension, index)["time"].values, prepend=-np.inf) > 0
+    times = _select(observed, dimension, index)["time"].values
+    is_later = np.diff(times, prepend=-np.inf) > 0
     groups = {}
     for label in arviz_data.groups(result):
         if label in _NOT_OF_SERIES:
@@ -109,10 +110,10 @@ def select_series(result: Any, series: Any) -> Any:
         elif label == "constant_data":
             names = {str(name): str(name).partition(OF_SERIES) for name in dataset}
             dataset = dataset[[name for name, (_, _, owner) in names.items() if owner in ("", str(labels[index]))]]
+        elif label == "predictions":
+            last = np.max(times[is_observed[index]], initial=-np.inf)
+            dataset = dataset.assign_attrs(last_observation=float(last))
         groups[label] = dataset
-    times = groups["observed_data"]["time"].values[groups["observed_data"][name].notnull().any("output").values]
-    if "predictions" in groups:
-        groups["predictions"].attrs["last_observation"] = float(np.max(times, initial=-np.inf))
     attrs = _select_mode(arviz_data.attributes(result), arviz_data.group(result, "posterior"), dimension, index)
     return arviz_data.build(groups, attrs | {"selected": f"{dimension} {labels[index]}"})
 

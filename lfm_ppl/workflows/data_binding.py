@@ -77,15 +77,13 @@ def check_requested_times(bound: BoundModel, times: Any, name: str = "at") -> No
     if np.ndim(times) > 1 and not (has_series_times and np.shape(times)[:-1] == (len(bound.times),)):
         expected = f"(K,), or ({len(bound.times)}, K) for each series" if has_series_times else "(K,)"
         raise ValueError(f"{name} must have shape {expected}, got {np.shape(times)}.")
-    if not has_series_times:
-        build_time_grid(example.ssm, bound.times, example.steps, example.max_step, times, tolerance=example.tolerance)
-        return
-    rows = times if np.ndim(times) == 2 else [times] * len(bound.times)
-    for series, (data_times, row) in enumerate(zip(bound.times, rows, strict=True)):
+    data_times = bound.times if has_series_times else [bound.times]
+    rows = times if np.ndim(times) == 2 else [times] * len(data_times)
+    for series, pair in enumerate(zip(data_times, rows, strict=True)):
         try:
-            build_time_grid(example.ssm, data_times, example.steps, None, row, tolerance=example.tolerance)
+            build_time_grid(example.ssm, pair[0], example.steps, example.max_step, pair[1], tolerance=example.tolerance)
         except ValueError as error:
-            raise ValueError(f"series {series}: {error}") from None
+            raise ValueError(f"series {series}: {error}" if has_series_times else str(error)) from None
 
 
 def warn_of_missing_predictions(bound: BoundModel, times: Any) -> None:

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lfm_ppl.io.data_set import InputTable
-from lfm_ppl.results.inputs import FORECAST, input_unit, inputs_of, time_origin, time_unit
+from lfm_ppl.results.inputs import FORECAST, input_unit, inputs_of
 from lfm_ppl.results.plots import forecasts, style
-from lfm_ppl.results.plots.trajectories import MAX_PANELS
+from lfm_ppl.results.plots.trajectories import MAX_PANELS, finish
 from lfm_ppl.utils.checks import unknown
 
 _MANY = 150  # values, from which they have no marks
@@ -65,11 +65,7 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
         style.label_values(axes, name, input_unit(result, name))
     if window := forecasts.forecast_window(result):
         panels[0].set_xlim(window)
-    style.label_time(panels, time_unit(result), time_origin(result))
-    figure.align_ylabels(panels)
-    style.legend_above(figure)
-    if note:
-        style.note_below(figure, note)
+    finish(figure, panels, result, note)
     return figure
 
 

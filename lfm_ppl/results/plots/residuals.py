@@ -22,7 +22,7 @@ from matplotlib.ticker import MaxNLocator
 from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.plots.trajectories import pick, series_views
+from lfm_ppl.results.plots.trajectories import finish, pick, series_views
 from lfm_ppl.results.residuals import (
     autocorrelation,
     default_lags,
@@ -100,11 +100,7 @@ def _draw_series(views: Mapping[str, Any], names: Sequence[str], note: str, widt
         _draw_over_time(axes, view, name)
         axes.set_title(f"{title}, {name}" if len(names) > 1 else title)
         axes.set_ylabel("residual (sd)")
-    view = next(iter(views.values()))
-    style.label_time(panels, time_unit(view), time_origin(view))
-    style.legend_above(figure)
-    if note:
-        style.note_below(figure, note)
+    finish(figure, panels, view, note)
     return figure
 
 

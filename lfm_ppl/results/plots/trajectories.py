@@ -84,7 +84,7 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any =
         _draw_data(axes, group(part, "observed_data")["y"].sel(output=name))
         forecasts.draw_held_out(axes, part, name)
         style.label_values(axes, name, unit_of(observed, name), title)
-    _finish(figure, panels, result, f"{remark} {note}")
+    finish(figure, panels, result, f"{remark} {note}")
     return figure
 
 
@@ -250,7 +250,7 @@ def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, series: 
         style.label_values(axes, name, unit_of(draws, name), title)
     shortened = [name for name in names if name in windows]
     periods = f"Of {', '.join(shortened)} {SHOWN_PERIODS} periods at the end of the data." if shortened else ""
-    _finish(figure, panels, result, f"{remark} {periods} {note}")
+    finish(figure, panels, result, f"{remark} {periods} {note}")
     return figure
 
 
@@ -262,7 +262,8 @@ def _season_windows(draws: xr.DataArray, end: float) -> dict[str, tuple[float, f
             for name, period in periods.items() if repeats_often(period, max(end, times[-1]) - times[0])}
 
 
-def _finish(figure: Figure, panels: list[Axes], result: Any, remark: str) -> None:
+def finish(figure: Figure, panels: list[Axes], result: Any, remark: str) -> None:
+    """Label the time of all panels, and add a legend and a remark."""
     style.label_time(panels, time_unit(result), time_origin(result))
     figure.align_ylabels(panels)
     style.legend_above(figure)
