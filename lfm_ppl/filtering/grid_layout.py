@@ -48,8 +48,8 @@ class GridLayout(NamedTuple):
     def padded(self) -> GridLayout:
         """Return a layout of few different sizes, so that similar times share a compiled program.
 
-        Intervals of length zero are appended where there are more intervals than observations, and lengths where there
-        are several.
+        Intervals of length zero are appended where there are more intervals than observations, and lengths where that
+        costs little.
         """
         grid, fields = self.grid, self.grid.intervals._asdict()
         count, lengths = len(fields["length"]), grid.lengths
@@ -62,8 +62,8 @@ class GridLayout(NamedTuple):
             since = np.append(grid.since, np.full(extra, grid.since[-1] + grid.intervals.length[-1]))
             grid = grid._replace(intervals=Intervals(**fields), since=since)
             lengths = None if lengths is None else np.append(lengths, 0.0)
-        if lengths is not None and len(lengths) > 1:
-            size = max(len(lengths), min(padded_size(len(lengths)), count + extra))
+        if lengths is not None:
+            size = _padded_lengths(len(lengths), count + extra)
             lengths = np.append(lengths, np.full(size - len(lengths), lengths[-1]))
         return self._replace(grid=grid._replace(lengths=lengths))
 
@@ -82,6 +82,14 @@ class GridLayout(NamedTuple):
         return insert_traced_times(self.grid._replace(intervals=intervals._replace(inset=inner)),
                                    self.breakpoints(reads, only_lagged=True), events,
                                    np.asarray(self.is_event_lagged, bool), scale)
+
+
+def _padded_lengths(count: int, intervals: int) -> int:
+    """Return the size of a table of interval lengths: of irregular times, or where the table is small."""
+    if 4 * count > intervals:
+        return min(padded_size(count), intervals)
+    size = padded_size(count) if count > 16 else 2 ** (count - 1).bit_length()
+    return size if 8 * size <= intervals else count
 
 
 def time_scale(reads: Sequence[InputRead]) -> Any:
