@@ -5,9 +5,11 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+import xarray as xr
 from matplotlib import pyplot
 
 import lfm_ppl as lfm
+from lfm_ppl.results import arviz_data
 from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.plots import plot_fit, plot_forces, plot_residuals, plot_states
 
@@ -83,7 +85,7 @@ def test_a_forecast_is_that_of_each_series(result, times):
         np.testing.assert_allclose(predicted["y_sd"][0, 0, :, 0], sd, rtol=1e-9)
 
 
-def test_a_nonlinear_forecast_follows_the_dynamics():
+def test_a_nonlinear_forecast_follows_the_dynamics(result):
     """dx/dt = -x^3 without noise: x(t) = (x(0)^-2 + 2 t)^-1/2, between the rows and after them."""
 
     def cubic(times, y=None):
@@ -94,9 +96,8 @@ def test_a_nonlinear_forecast_follows_the_dynamics():
                 lfm.Gaussian(start[None], 1e-12 * jnp.eye(1)), process_noise=1e-12 * jnp.eye(1)),
                 jnp.array([1.0, 2.0]), times, steps=20), obs=y)
 
-    draws = {"scale": np.ones((1, 4))}
-    with pytest.warns(lfm.ConvergenceWarning):
-        result = lfm.to_arviz(draws, cubic, TIMES, Y, trajectory_draws=0)
+    draws = xr.Dataset({"scale": (("chain", "draw"), np.ones((1, 2)))})
+    result = arviz_data.build({"posterior": draws, "observed_data": group(result, "observed_data")})
     times = np.array([[1.5, 5.0, 9.0], [0.2, 3.5, 4.0]])
     states = group(lfm.forecast(result, cubic, times, progress=False), "predictions")["states"]
     exact = (np.array([[1.0], [2.0]]) ** -2 + 2 * times) ** -0.5
@@ -117,7 +118,7 @@ def test_figures_have_axes_for_each_series(result):
 
 
 def test_the_report_shows_the_series(result, tmp_path):
-    ahead = lfm.forecast(result, model, [[6.0], [7.0]], progress=False)
+    ahead = lfm.forecast(result, model, [[1.5, 7.0], [3.5, 9.0]], progress=False)
     page = lfm.save_report(ahead, tmp_path).read_text()
     assert "patient Ann" in page and "could not be drawn" not in page
     assert "could not be drawn" not in lfm.save_report(lfm.select_series(ahead, "Bo"), tmp_path / "b.html").read_text()
