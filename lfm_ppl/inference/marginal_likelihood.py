@@ -78,8 +78,8 @@ class MarginalLikelihood(SeriesLikelihood):
         lower: name of a state, force or output -> its lower bound. Under constraints the log density is
             log Z(y, c) - log Z(c), that of the data given that the constraints are respected: by expectation
             propagation, made right with ``draws`` trajectories that respect them. It is -inf where that does not
-            converge. Not with an observation family, ``iterations``, ``max_step`` or ``tolerance``. The object is then
-            an `lfm_ppl.inference.constrained_likelihood.ConstrainedLikelihood`.
+            converge. Not with an observation family, ``iterations``, ``max_step``, ``tolerance`` or ``method``. The
+            object is then an `lfm_ppl.inference.constrained_likelihood.ConstrainedLikelihood`.
         upper: the same for upper bounds.
         constraints: functions c(x, u, t), feasible where >= 0; with ``draws``, linear in x and u.
         grid: (K,) times at which the constraints hold, or how many at equal distances from the initial time to the last
@@ -232,11 +232,13 @@ def _check_model(model: Any) -> None:
 
 
 def _refuse_filter_settings(max_step: Any = None, iterations: Any = None, damping: float = 0.7, tolerance: Any = None,
-                            sites: Any = None, method: Any = None, validate_args: Any = None) -> None:
+                            sites: Any = None, method: str = RUNGE_KUTTA, validate_args: Any = None) -> None:
     """Raise ValueError for a setting of the filter that a likelihood under constraints does not have."""
-    for name, value in (("max_step", max_step), ("tolerance", tolerance), ("method", method)):
+    for name, value in (("max_step", max_step), ("tolerance", tolerance)):
         if value is not None:
             raise ValueError(f"{name} is not supported under constraints, which add rows to the grid; raise steps.")
+    if method != RUNGE_KUTTA:
+        raise ValueError(f"method={method!r} is not supported under constraints; leave method out.")
     if iterations:
         raise ValueError("under constraints a non-linear model is always linearised about smoothed moments. Leave "
                          "iterations out.")
