@@ -16,6 +16,10 @@ RUNGE_KUTTA, EXPONENTIAL = METHODS = "runge-kutta", "exponential"
 """Methods of integration: explicit, and A-stable for stiff dynamics."""
 
 
+_BLOCK = 128
+"""Largest number of intervals whose transitions are computed at once."""
+
+
 class Intervals(NamedTuple):
     """The intervals of the scan, one entry each: a prediction, perhaps a jump, perhaps an observation.
 
@@ -29,6 +33,7 @@ class Intervals(NamedTuple):
         inset: (N,) how far inside of the interval functions of time are evaluated at its ends, see `Span`.
         event: (N,) index of the event of the model at its end, before the observation; -1 where there is none.
         state_map: the maps of these events; None where they are not needed, or without events.
+        transition: exact transition of each interval, see `with_transitions`; None where it is tabulated by length.
     """
 
     start: Any
@@ -40,6 +45,7 @@ class Intervals(NamedTuple):
     inset: Any
     event: Any
     state_map: Any = None
+    transition: Any = None
 
     @property
     def span(self) -> Span:
@@ -133,6 +139,21 @@ def by_length(grid: TimeGrid, make: Callable[[jax.Array], Any]) -> Callable[[Int
         return lambda interval: make(interval.length)
     table = _LengthTable(make, jnp.asarray(grid.lengths))
     return lambda interval: table.value(interval.length_index)
+
+
+def with_transitions(grid: TimeGrid, make: Callable[[jax.Array], Any]) -> TimeGrid:
+    """Return the grid with the result of ``make``, from lengths (B,), for each interval.
+
+    A block of lengths at once takes a fraction of the time of one length after another in the scan. Reverse mode stores
+    no more than the result.
+    """
+    lengths = jnp.asarray(grid.intervals.length)
+    count = lengths.shape[0]
+    size = min(_BLOCK, count)
+    blocks = jnp.pad(lengths, (0, -count % size)).reshape(-1, size)
+    transitions = jax.lax.map(jax.checkpoint(make, prevent_cse=False), blocks)
+    transitions = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:count], transitions)
+    return grid._replace(intervals=grid.intervals._replace(transition=transitions))
 
 
 def with_observations(intervals: Intervals, y: Any) -> tuple[Intervals, jax.Array]:

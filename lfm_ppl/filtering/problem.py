@@ -7,6 +7,7 @@ propagation) share them, so that their derivatives are taken once.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.dynamics import Dynamics
-from lfm_ppl.filtering.intervals import EXPONENTIAL, Intervals, TimeGrid, by_length, with_state_maps
+from lfm_ppl.filtering.intervals import EXPONENTIAL, Intervals, TimeGrid, by_length, with_state_maps, with_transitions
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.predict import interval_factor
 from lfm_ppl.filtering.transition import LinearPart, constant_jacobian, exact, linear_part
@@ -90,9 +91,14 @@ def filter_problem(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> FilterPr
             return None
         return interval_factor(ssm, rule, linear, length, grid.steps, is_tabulated)
 
-    shared = SharedTransitions(linear, _observation_jacobian(ssm, grid), by_length(grid, transition),
-                               ssm.stack.jump_table())
-    return FilterProblem(ssm, rule, with_state_maps(ssm, grid), shared)
+    grid = with_state_maps(ssm, grid)
+    if grid.lengths is None and has_exact_transitions(ssm, grid):
+        grid = with_transitions(grid, transition)
+        transition_of: Callable[[Intervals], Any] = operator.attrgetter("transition")
+    else:
+        transition_of = by_length(grid, transition)
+    shared = SharedTransitions(linear, _observation_jacobian(ssm, grid), transition_of, ssm.stack.jump_table())
+    return FilterProblem(ssm, rule, grid, shared)
 
 
 def _observation_jacobian(ssm: StateSpaceModel, grid: TimeGrid) -> jax.Array:

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.forces.discretise import discretise
+from lfm_ppl.forces.discretise import discretise, discretise_steps
 from lfm_ppl.linearisation.rule import Function, partial_jacobian, selection
 from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -103,15 +103,18 @@ def feedback(ssm: StateSpaceModel, linear: LinearPart) -> jax.Array:
 
 
 def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPart | None = None) -> Exact:
-    """Return the transition of a linear time-invariant model over an interval of ``length``.
+    """Return the transition of a linear time-invariant model over an interval of ``length``, or of many (B,).
 
     Its ``linear`` part is that of any time. The offset is exact where the mean is invariant; otherwise zero, and the
     filter integrates it with E(h/2), E(h).
     """
     size, total = ssm.physical_dim, ssm.state_dim
+    is_block = jnp.ndim(length) == 1
+    discretise_joint = discretise_steps if is_block else discretise
+    discretise_forces = jax.vmap(ssm.stack.discretise) if is_block else ssm.stack.discretise
     if size == 0:
-        phi, process_cov = ssm.stack.discretise(length)
-        return Exact(phi, process_cov, jnp.zeros(total), phi, phi)
+        phi, process_cov = discretise_forces(length)
+        return Exact(phi, process_cov, jnp.zeros(phi.shape[:-1]), phi, phi)
     t = jnp.zeros(())
     linear = linear_part(ssm, t) if linear is None else linear
     matrix, shift = ssm.input_map(t)
@@ -123,15 +126,15 @@ def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPar
         matmul(ssm.stack.dispersion(), ssm.stack.dispersion().T), jnp.zeros((1, 1)))
     # One more state that is constantly one carries the offset.
     augmented = jnp.zeros((total + 1, total + 1)).at[:total, :total].set(lin).at[:total, total].set(constant)
-    phi, process_cov = discretise(augmented, diffusion, length)
-    forces, force_cov = ssm.stack.discretise(length)
-    phi = phi.at[size:total, size:total].set(forces)
-    process_cov = process_cov.at[size:total, size:total].set(force_cov) if size else process_cov
-    half = full = phi[:total, :total]
+    phi, process_cov = discretise_joint(augmented, diffusion, length)
+    forces, force_cov = discretise_forces(length)
+    phi = phi.at[..., size:total, size:total].set(forces)
+    process_cov = process_cov.at[..., size:total, size:total].set(force_cov) if size else process_cov
+    half = full = phi[..., :total, :total]
     if not ssm.mean_invariant:
-        half, _ = discretise(lin, jnp.zeros_like(lin), 0.5 * length / steps)
+        half, _ = discretise_joint(lin, jnp.zeros_like(lin), 0.5 * length / steps)
         full = matmul(half, half)
-    return Exact(phi[:total, :total], process_cov[:total, :total], phi[:total, total], half, full)
+    return Exact(phi[..., :total, :total], process_cov[..., :total, :total], phi[..., :total, total], half, full)
 
 
 def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array, stages: bool = True,

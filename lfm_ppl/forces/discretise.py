@@ -27,6 +27,9 @@ from lfm_ppl.utils.linalg import matmul
 SUBSTEP = 0.5
 """Largest size of F h on a substep; 13 terms of the power series are then exact to rounding."""
 
+_LARGEST_VECTORISED = 8
+"""Largest dimension of `discretise_steps` whose products are broadcast; XLA's dot is faster above it."""
+
 
 @functools.partial(jax.jit, static_argnames="max_doublings")
 def discretise(
@@ -69,6 +72,66 @@ def discretise(
     integrand = matmul(matmul(transition, diffusion), transition.mT)
     noise = step * (weights[:, None, None] * integrand).sum(0)
     return double(series.sum(0), noise, doublings, max_doublings)
+
+
+def discretise_steps(
+    feedback: jax.Array, diffusion: jax.Array, dt: jax.Array, max_doublings: int = 32
+) -> tuple[jax.Array, jax.Array]:
+    """Return transitions and process noises of steps of many lengths, as `discretise` does for each of them.
+
+    The powers of ``F`` are shared by all steps, and the loop over doublings skips those that no step needs. The axis of
+    the steps is the last one of all arrays, along which XLA vectorises.
+
+    Args:
+        feedback: ``F`` of shape (n, n), in 1/time.
+        diffusion: ``D`` of shape (n, n), symmetric positive semi-definite.
+        dt: lengths of the steps, (B,).
+        max_doublings: as in `discretise`.
+
+    Returns:
+        ``Phi`` and ``Q``, (B, n, n) each.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> transition, _ = discretise_steps(-jnp.eye(1), jnp.eye(1), jnp.array([0.0, 1.0]))
+        >>> [round(float(entry), 4) for entry in transition[:, 0, 0]]
+        [1.0, 0.3679]
+    """
+    feedback, diffusion, dt = _as_arrays(feedback, diffusion, dt)
+    if feedback.shape[0] > _LARGEST_VECTORISED:
+        return jax.vmap(discretise, (None, None, 0, None))(feedback, diffusion, dt, max_doublings)
+    rate = _growth(jax.lax.stop_gradient(feedback))
+    doublings = doublings_for(rate * dt)
+    step = dt * jnp.exp2(-doublings)
+    unit = jnp.where(rate > 0.0, rate, 1.0)
+    series = _power_series(feedback / unit)
+
+    def transition_over(times: jax.Array) -> jax.Array:
+        return jnp.tensordot(series, powers(unit * times, len(series)), axes=(0, -1))
+
+    nodes, weights = _quadrature(series)
+    to_end = transition_over(nodes[:, None] * step)
+    integrand = _product(_product(to_end, diffusion[:, :, None, None]), to_end.swapaxes(0, 1))
+    noise = step * (weights[:, None] * integrand).sum(-2)
+
+    def double_once(index: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        def doubled() -> tuple[jax.Array, jax.Array]:
+            phi, q = carry
+            is_active = index < doublings
+            longer = _product(phi, phi), q + _product(_product(phi, q), phi.swapaxes(0, 1))
+            return jnp.where(is_active, longer[0], phi), jnp.where(is_active, longer[1], q)
+
+        return jax.lax.cond(jnp.any(index < doublings), doubled, lambda: carry)
+
+    phi, q = jax.lax.fori_loop(0, max_doublings, double_once, (transition_over(step), noise))
+    is_complete = doublings <= max_doublings
+    phi, q = jnp.where(is_complete, phi, jnp.nan), jnp.where(is_complete, 0.5 * (q + q.swapaxes(0, 1)), jnp.nan)
+    return jnp.moveaxis(phi, -1, 0), jnp.moveaxis(q, -1, 0)
+
+
+def _product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return the products of matrices (n, n, ...) whose first two axes are rows and columns."""
+    return (a[:, :, None] * b[None]).sum(1)
 
 
 @functools.partial(jax.jit, static_argnames="max_doublings")
@@ -208,14 +271,17 @@ def _substep_series(feedback, dt):
     """Return the terms ``(F h)^k / k!`` of the power series on the substep, the substep h and the doublings s."""
     doublings = doublings_for(_growth(jax.lax.stop_gradient(feedback * dt)))
     step = dt * jnp.exp2(-doublings)
-    scaled = feedback * step
+    return _power_series(feedback * step), step, doublings
+
+
+def _power_series(scaled):
+    """Return the terms ``X^k / k!`` (K, n, n) of the power series of exp(X)."""
 
     def body(term, k):
         return matmul(scaled, term) / k, term
 
-    orders = jnp.arange(1, 1 + term_count(feedback.shape[0]), dtype=feedback.dtype)
-    _, series = jax.lax.scan(body, jnp.eye(feedback.shape[0], dtype=feedback.dtype), orders)
-    return series, step, doublings
+    orders = jnp.arange(1, 1 + term_count(scaled.shape[0]), dtype=scaled.dtype)
+    return jax.lax.scan(body, jnp.eye(scaled.shape[0], dtype=scaled.dtype), orders)[1]
 
 
 def _growth(matrix):

@@ -9,7 +9,7 @@ import pytest
 from jax.test_util import check_grads
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lfm_ppl.forces.discretise import discretise, discretise_dispersion
+from lfm_ppl.forces.discretise import discretise, discretise_dispersion, discretise_steps
 
 step = jax.jit(discretise, static_argnums=3)
 DTS = np.array([1e-6, 0.1, 1.0, 4.0])
@@ -118,3 +118,22 @@ def test_vmap_equals_loop():
     for i in range(3):
         for result, expected in zip(batch, step(feedback[i], np.eye(3), dts[i]), strict=True):
             assert_allclose(result[i], expected, rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", [*SYSTEMS, "nine states"])
+def test_many_steps_equal_single_steps(name):
+    feedback = -np.eye(9) if name == "nine states" else SYSTEMS[name]
+    diffusion = np.diag(np.arange(1.0, 1.0 + len(feedback)))
+    dts = np.append(DTS, 0.0)
+    many = jax.jit(discretise_steps)(feedback, diffusion, dts)
+    single = jax.jit(jax.vmap(discretise, (None, None, 0)))(feedback, diffusion, dts)
+    for result, expected in zip(many, single, strict=True):
+        assert_allclose(result, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_gradients_of_many_steps():
+    def flow(feedback, diffusion, dts):
+        return jnp.stack(discretise_steps(feedback, diffusion @ diffusion.T, dts, 8))
+
+    arguments = (jnp.asarray(SYSTEMS["repeated root"]), jnp.eye(3), jnp.array([0.0, 1e-9, 0.3, 3.0]))
+    check_grads(jax.jit(flow), arguments, order=1, modes=("fwd", "rev"), eps=1e-5, rtol=1e-6, atol=1e-7)

@@ -123,6 +123,30 @@ def test_long_regression(benchmark, count):
     assert 1e6 * benchmark.stats.stats.min / count < 20.0
 
 
+def test_gradient_with_irregular_rows():
+    """Each row has its own transition; a gradient takes at most six values, in memory linear in the rows."""
+    count = 100_000
+    times = np.sort(np.random.default_rng(0).uniform(0.0, count / 10, count))
+    y = np.sin(times / 7.0)[:, None]
+
+    def density(theta):
+        rate, damping, lengthscale = theta
+        model = lfm.LatentForceModel(
+            lambda x, u, t: jnp.stack([x[1], -rate * x[0] - damping * x[1] + u[0]]),
+            {"f": lfm.Matern(1.0, lengthscale)}, lfm.GaussianObservation(lambda x, u, t: x[:1], jnp.array([0.01])),
+            lfm.Gaussian(jnp.zeros(2), jnp.eye(2)), initial_time=0.0)
+        return lfm.MarginalLikelihood(model, times).log_prob(y)
+
+    def seconds(program):
+        run = jax.jit(program)
+        jax.block_until_ready(run(jnp.ones(3)))
+        return min(timeit.repeat(lambda: jax.block_until_ready(run(jnp.ones(3))), number=1, repeat=5))
+
+    value, gradient = seconds(density), seconds(forward(density))
+    assert 1e6 * value / count < 20.0
+    assert gradient < 6.0 * value
+
+
 def process(observation, theta, times, y):
     """A Matern-3/2 process that is observed itself."""
     model = lfm.LatentForceModel(
