@@ -138,7 +138,7 @@ class TracedModel:
         if checks.traced([measured[:2] for measured in recorded.values()]):
             # In `jax.jvp`, unlike in `jax.jit`, only what depends on the inputs is traced.
             values = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype) if checks.traced(leaf) else leaf, data)
-            recorded = self._recorded(_measure, self._seeded, _differentiate, z, values)
+            recorded = self._recorded(_measure, self._seeded, lambda run, *point: jax.jvp(run, point, point), z, values)
         self._structures = [structure for _, _, structure in recorded.values()]
         for site in self._likelihoods:
             traced_times, layout, _ = recorded.get(site.name, (None, None, None))
@@ -306,11 +306,6 @@ def _traced_structure(likelihood: MarginalLikelihood) -> Hashable:
     """Return the same where times and inputs are traced; raise ValueError if its inputs are read in another way."""
     _ = likelihood.time_grid
     return _structure(likelihood)
-
-
-def _differentiate(run: Callable, z: jax.Array, y: Any) -> None:
-    """Run a function of z and y with tracers of `jax.jvp`."""
-    jax.jvp(run, (z, y), (z, jax.tree.map(jnp.zeros_like, y)))
 
 
 _models: OrderedDict[Hashable, TracedModel] = OrderedDict()
