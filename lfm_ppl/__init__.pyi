@@ -81,6 +81,7 @@ from .results.plots import plot_states as plot_states
 from .results.plots import plot_trace as plot_trace
 from .results.scoring import score as score
 from .results.series import select_series as select_series
+from .results.sites import select_site as select_site
 from .switching.rao_blackwellised import rao_blackwellised as rao_blackwellised
 from .switching.rule import SwitchingRule as SwitchingRule
 from .switching.rule import Thermostat as Thermostat

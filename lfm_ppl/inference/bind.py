@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,14 +17,15 @@ from lfm_ppl.inference.traced_model import traced_model
 from lfm_ppl.utils import checks
 
 
-def bind(model: Callable, times: ArrayLike, y: ArrayLike, **keywords: Any) -> BoundModel:
+def bind(model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y: ArrayLike | Mapping[str, ArrayLike],
+         **keywords: Any) -> BoundModel:
     """Bind a NumPyro model to its times and data: its log posterior as a plain function, for any sampler.
 
     Args:
         model: ``model(times, y=None, **keywords)`` with one site ``numpyro.sample(name, lfm.MarginalLikelihood(...),
-            obs=y)``, or a `lfm_ppl.panel` in a plate.
-        times: (T,), or (B, T) for a panel.
-        y: (T, D), or (B, T, D) for a panel; NaN where missing. A tracer within compiled code.
+            obs=y)``, or a `lfm_ppl.panel` in a plate; or with several such sites, see below.
+        times: (T,), or (B, T) for a panel; of several sites a dict of these by name of the site.
+        y: (T, D), or (B, T, D) for a panel; NaN where missing. A tracer within compiled code. A dict like ``times``.
         **keywords: further arguments of the model. Arrays of real numbers, such as known inputs, doses and covariances
             of rows, are arguments of the compiled functions; other values decide what is compiled.
 
@@ -33,11 +35,12 @@ def bind(model: Callable, times: ArrayLike, y: ArrayLike, **keywords: Any) -> Bo
         same shapes, unless a global or closure variable that it reads has changed, or the time grid has another size
         (other numbers of breakpoints and doses between observations, of intervals in a long gap, of equal intervals).
         A model that needs the values of times or arrays, such as ``if times[-1] > 1``, is compiled for these values,
-        and so is one with a panel or constraints.
+        and so is one with a panel or constraints. Of several sites, ``site_models["name"]`` is the bound model with one
+        of them selected, for ``log_likelihood``, ``filter`` and ``smooth``.
 
     Raises:
-        ValueError, TypeError: wrong shapes, traced times, a discrete parameter or none at all, no or
-            several likelihood sites.
+        ValueError, TypeError: wrong shapes, traced times, a discrete parameter or none at all, no likelihood site,
+            several sites without dicts, or dicts without one of the sites.
 
     Example:
         >>> import jax, jax.numpy as jnp, numpy as np, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
@@ -53,6 +56,23 @@ def bind(model: Callable, times: ArrayLike, y: ArrayLike, **keywords: Any) -> Bo
         >>> z = bound.unconstrain({"rate": 1.0})
         >>> bound.names, z.tolist(), float(bound.constrain(z)["rate"])
         (('rate',), [0.0], 1.0)
+
+        Two experiments that share a parameter are two sites, with times and data by name:
+
+        >>> def experiments(times, y):
+        ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
+        ...     for name in ("short", "long"):
+        ...         system = lfm.LatentForceModel(
+        ...             lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
+        ...             lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...             lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...         numpyro.sample(name, lfm.MarginalLikelihood(system, times[name]), obs=y[name])
+        >>> both = lfm.bind(experiments, {"short": times[:3], "long": times},
+        ...                 {"short": np.ones((3, 1)), "long": np.sin(times)[:, None]})
+        >>> both.site_models["short"].smooth(z).mean.shape
+        (3, 1)
+        >>> bool(jnp.isclose(both.site_models["long"].log_likelihood(z), bound.log_likelihood(z)))
+        True
 
         Many data sets side by side:
 
@@ -87,25 +107,66 @@ def bind(model: Callable, times: ArrayLike, y: ArrayLike, **keywords: Any) -> Bo
                         "outside of jit, and pass only y into it.")
     if y is None:
         raise ValueError("y must be the observations, (T, D) or (B, T, D) for a panel, got None.")
-    checks.refuse_dates("times", times)
-    times = np.array(checks.unmask(times), float)
-    values = jnp.asarray(checks.unmask(y), float)
-    y = values[:, None] if values.ndim == times.ndim == 1 else values
-    traced, data = traced_model(model, (times, y), keywords, "lfm.bind")
+    is_by_site = isinstance(times, Mapping) or isinstance(y, Mapping)
+    times, values = _arrays_by_site(times, y) if is_by_site else _arrays(times, y)
+    columns = jax.tree.map(lambda y, times: y[:, None] if y.ndim == times.ndim == 1 else y, values, times)
+    try:
+        traced, data = traced_model(model, (times, columns), keywords, "lfm.bind")
+    except (IndexError, KeyError) as error:
+        # A dict without a site that the model reads, or an array in the place of a dict.
+        is_missing = is_by_site and isinstance(error, KeyError) and error.args[0] not in values
+        if not is_missing and (is_by_site or "are valid indices" not in str(error)):
+            raise
+        entry = repr(error.args[0]) if is_missing else '"y"'
+        raise ValueError(f"the model reads times or y by the name of a site, and there is no entry {entry}; pass dicts "
+                         f"by site, in lfm.fit {{{entry}: (times, y), ...}}.") from error
     bound = BoundModel(traced, data)
-    if bound.site.name in bound.sites:
-        raise ValueError(f"the model does not use the data: its likelihood site {bound.site.name!r} is not observed. "
-                         f"Write numpyro.sample({bound.site.name!r}, ..., obs=y), with the argument y of the model.")
-    for name in traced.sites_of_times:
-        raise ValueError(f"the likelihood site {name!r} observes the times, not the data. Write "
-                         f"numpyro.sample({name!r}, ..., obs=y), with the argument y of the model.")
-    distribution = bound.site.distribution
-    if isinstance(distribution, Panel):
-        distribution.checked(values)
-    else:
-        rows, outputs = distribution.event_shape
-        check_observations(values, rows, outputs, model=distribution.model)
+    if is_by_site and not bound.is_by_site:
+        sites = ", ".join(site.name for site in traced.likelihoods) or "none"
+        raise ValueError(f"the likelihood sites of the model are {sites}, and there are data of {', '.join(values)}: "
+                         "pass {name: (times, y), ...} with all sites, and write numpyro.sample(name, "
+                         "lfm.MarginalLikelihood(system, times[name]), obs=y[name]) in model(times, y).")
+    for name, site_model in bound.site_models.items():
+        _check_data(site_model, values[name] if is_by_site else values)
     return bound
+
+
+def _arrays(times: Any, y: Any) -> tuple[Any, Any]:
+    checks.refuse_dates("times", times)
+    return np.array(checks.unmask(times), float), jnp.asarray(checks.unmask(y), float)
+
+
+def _arrays_by_site(times: Any, y: Any) -> tuple[Any, Any]:
+    """Return dicts of times and observations as dicts of arrays."""
+    names = [", ".join(value) if isinstance(value, Mapping) else "no dict" for value in (times, y)]
+    if "no dict" in names or not times or set(times) != set(y):
+        raise ValueError("times and y of several likelihood sites must be dicts with the same names, the names of the "
+                         f"sites; times has {names[0] or 'none'}, and y has {names[1] or 'none'}.")
+    if empty := [name for name, value in y.items() if value is None]:
+        raise ValueError(f"y[{empty[0]!r}] must be the observations of the site, got None.")
+    pairs = {name: _arrays(times[name], y[name]) for name in times}
+    return {name: pair[0] for name, pair in pairs.items()}, {name: pair[1] for name, pair in pairs.items()}
+
+
+def _check_data(bound: BoundModel, values: jax.Array) -> None:
+    """Check that a likelihood site observes the data, and their shape."""
+    name, argument = bound.site.name, f"y[{bound.site.name!r}]" if bound.is_by_site else "y"
+    remedy = f"Write numpyro.sample({name!r}, ..., obs={argument}), with the argument y of the model."
+    if name in bound.sites:
+        raise ValueError(f"the model does not use the data: its likelihood site {name!r} is not observed. {remedy}")
+    if name in bound.traced.sites_of_times:
+        raise ValueError(f"the likelihood site {name!r} observes the times, not the data. {remedy}")
+    if bound.is_by_site and name in bound.traced.sites_of_other_data:
+        raise ValueError(f"the likelihood site {name!r} observes other data than those that were passed. {remedy}")
+    distribution = bound.site.distribution
+    try:
+        if isinstance(distribution, Panel):
+            distribution.checked(values)
+        else:
+            rows, outputs = distribution.event_shape
+            check_observations(values, rows, outputs, model=distribution.model)
+    except ValueError as error:
+        raise ValueError(f"site {name!r}: {error}" if bound.is_by_site else str(error)) from None
 
 
 def bind_arguments(model: Callable, arguments: tuple, keywords: Mapping[str, Any],

@@ -52,18 +52,45 @@ class BoundModel:
     Every method of z and y can be traced (``jax.jit``, ``jax.grad``, ``jax.vmap``); z is a vector (d,) in the order of
     ``names``, and ``y`` defaults to the bound data.
 
+    A model with several likelihood sites has times and data by name of the site. `site_models` holds the same model
+    with one site selected. Times, data, ``log_likelihood``, ``likelihood``, ``filter`` and ``smooth`` then belong to
+    the site, densities and parameters to the whole model.
+
     Attributes:
-        y: the data.
+        model_data: the data of all sites.
         names: names of the d unconstrained coordinates: sites sorted by name, elements in C order.
         size: d.
         sites: names of the latent sites.
         traced: the model without its data.
     """
 
-    def __init__(self, traced: TracedModel, y: ArrayLike) -> None:
+    def __init__(self, traced: TracedModel, y: ArrayLike, selected: str | None = None) -> None:
         self.traced = traced
-        self.y: Any = y
+        self.model_data: Any = y
+        self._selected = selected
         self._trace: dict[str, Any] | None = None
+
+    @property
+    def y(self) -> Any:
+        """The data: of all sites, or of the selected site."""
+        return self.model_data if self._selected is None else self.model_data[self._selected]
+
+    @property
+    def is_by_site(self) -> bool:
+        """Whether times and data are dictionaries by name of a likelihood site."""
+        times = self.traced.arguments[0] if self.traced.arguments else None
+        return isinstance(times, Mapping) and set(times) == {site.name for site in self.traced.likelihoods}
+
+    @property
+    def site_models(self) -> dict[str, BoundModel]:
+        """The model with one likelihood site selected, by name of the site.
+
+        Raises:
+            ValueError: the model has several sites, and times and data are not given by site.
+        """
+        if not self.is_by_site or self._selected is not None:
+            return {self.site.name: self}
+        return {name: BoundModel(self.traced, self.model_data, name) for name in self.traced.arguments[0]}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,9 +108,12 @@ class BoundModel:
         return self.traced.sites
 
     @property
-    def times(self) -> np.ndarray:
-        """Times of the observations, (T,), or (B, T) for a panel whose series have different times."""
-        return np.asarray(self.traced.arguments[0], float)
+    def times(self) -> Any:
+        """Times of the observations, (T,), or (B, T) for a panel whose series have different times; a dict by site."""
+        times = self.traced.arguments[0]
+        if self.is_by_site:
+            return times if self._selected is None else times[self._selected]
+        return np.asarray(times, float)
 
     @property
     def model(self) -> Callable:
@@ -102,7 +132,7 @@ class BoundModel:
         Raises:
             ValueError: the model has no such site, or several.
         """
-        return self.traced.site
+        return self.traced.site(self._selected)
 
     @property
     def has_likelihood(self) -> bool:
@@ -123,31 +153,42 @@ class BoundModel:
         Raises:
             ValueError: another shape; an infinite entry.
         """
-        traced, y = self.traced, self._checked(y)
+        traced, y = self.traced, self._checked(self._of_all_sites(y))
         if traced.data_index is None:
             traced = TracedModel(traced.model, (*traced.arguments[:-1], y), None, traced.keywords, y, traced.caller)
-        return BoundModel(traced, y)
+        return BoundModel(traced, y, self._selected)
 
-    def data(self, y: ArrayLike | None = None) -> Any:
-        """Return the data: ``y`` after checking it, or the bound data.
+    def data(self, y: ArrayLike | Mapping[str, Any] | None = None) -> Any:
+        """Return the data: ``y`` after checking it, or the bound data; where a site is selected, the part of the site.
 
         Raises:
             ValueError: another shape, an infinite entry; the model needs the values of its data.
         """
+        data = self._all_data(y)
+        return data if self._selected is None else data[self._selected]
+
+    def _of_all_sites(self, y: Any) -> Any:
+        """Return data of all sites; data of the selected one replace its bound data."""
+        is_of_one = self._selected is not None and y is not None and not isinstance(y, Mapping)
+        return {**self.model_data, self._selected: y} if is_of_one else y
+
+    def _all_data(self, y: Any = None) -> Any:
         if isinstance(y, ModelArguments):
             return y.data
-        if y is None or y is self.y:
-            return self.y
+        y = self._of_all_sites(y)
+        if y is None or y is self.model_data:
+            return self.model_data
         if self.traced.data_index is None:
             raise ValueError("the model needs the values of its data, so that they cannot be an argument of compiled "
                              "code; bind the model to these data, bound.with_data(y).")
         return self._checked(y)
 
     def _checked(self, y: Any) -> Any:
-        shapes, expected = (jax.tree.map(np.shape, value) for value in (y, self.y))
+        shapes, expected = (jax.tree.map(np.shape, value) for value in (y, self.model_data))
         if shapes != expected:
             raise ValueError(f"y must have the shape that was bound, {expected}, got {shapes}; bind the model again.")
-        y = jax.tree.map(lambda new, old: jnp.asarray(checks.unmask(new), jnp.result_type(old)), y, self.y)
+        y = jax.tree.map(lambda new, old: jnp.asarray(checks.unmask(new), jnp.result_type(old)), y,
+                         self.model_data)
         for leaf in jax.tree.leaves(y):
             if (values := checks.concrete(leaf)) is not None and np.isinf(values).any():
                 raise ValueError("y has infinite entries; use NaN for a missing entry.")
@@ -156,16 +197,16 @@ class BoundModel:
     @property
     def argument(self) -> Any:
         """The argument of functions `compiled` for these times: the data, or None where they are constants."""
-        return None if self.traced.data_index is None else self.y
+        return None if self.traced.data_index is None else self.model_data
 
     @property
     def arguments(self) -> Any:
         """The argument of each `program`: data, times and inputs; None where they are constants of the program."""
-        return self.traced.program_arguments(self.y)
+        return self.traced.program_arguments(self.model_data)
 
     def _arguments(self, y: Any) -> Any:
-        # `data` raises an error where the data are constants and others are given.
-        return y if isinstance(y, ModelArguments) else self.traced.program_arguments(self.data(y))
+        # `_all_data` raises an error where the data are constants and others are given.
+        return y if isinstance(y, ModelArguments) else self.traced.program_arguments(self._all_data(y))
 
     def _position(self, z: Any) -> jax.Array:
         if np.shape(z) != (self.size,):
@@ -196,10 +237,10 @@ class BoundModel:
         return lambda z, y: run(z, self._arguments(y))
 
     def log_likelihood(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
-        """Return log p(y | T(z)), summed over the series of a panel; arguments as `log_density`."""
+        """Return log p(y | T(z)), summed over all sites and the series of a panel; arguments as `log_density`."""
         def log_likelihood(z: jax.Array, y: Any) -> jax.Array:
-            site = self._site_at(z, y)
-            return site.distribution.log_prob(site.observed).sum()
+            sites = [model._site_at(z, y) for model in self.site_models.values()]
+            return jnp.stack([site.distribution.log_prob(site.observed).sum() for site in sites]).sum()
 
         run = self.program("log likelihood", lambda: jax.jit(log_likelihood))
         return run(self._position(z), self._arguments(y))
@@ -237,7 +278,7 @@ class BoundModel:
         density_and_gradient = self.gradient(is_forward, jacobian)
 
         def minus(z: Any) -> tuple[Any, Any]:
-            value, gradient = density_and_gradient(jnp.asarray(z, float), self.y)
+            value, gradient = density_and_gradient(jnp.asarray(z, float), self.model_data)
             return -value, -gradient
 
         if not exact_hessian:
@@ -267,7 +308,7 @@ class BoundModel:
             z: (d,).
             y: as in `log_density`.
         """
-        return -self.traced.potential(jnp.asarray(z, float), self.data(y), handler)
+        return -self.traced.potential(jnp.asarray(z, float), self._all_data(y), handler)
 
     # --- parameters
 
@@ -302,7 +343,7 @@ class BoundModel:
         for name in self.sites:
             if name not in values:
                 raise ValueError(f"values has no value of {name!r}; it needs one for each of {', '.join(self.sites)}.")
-        z, trace = self.traced.unconstrain(values, self.y)
+        z, trace = self.traced.unconstrain(values, self.model_data)
         for name, site in trace.items():
             expected = tuple(site["fn"].batch_shape) + tuple(site["fn"].event_shape)
             if np.shape(values[name]) != expected:
@@ -314,7 +355,7 @@ class BoundModel:
 
     def draw(self, key: jax.Array, strategy: Callable = init_to_median) -> np.ndarray:
         """Return a point z (d,) by a NumPyro initialisation strategy."""
-        return np.asarray(self.traced.draw(self.y, key, strategy), float)
+        return np.asarray(self.traced.draw(self.model_data, key, strategy), float)
 
     def start(self, key: jax.Array, strategy: Callable = init_to_median, attempts: int = _ATTEMPTS,
               evaluate: Callable[[np.ndarray], Any] | None = None) -> np.ndarray:
@@ -343,8 +384,8 @@ class BoundModel:
         if self._trace is not None:
             return self._trace
         with jax.ensure_compile_time_eval():  # the call may come from compiled code
-            trace = self.traced.trace(self.y)
-        if not checks.traced(self.y):
+            trace = self.traced.trace(self.model_data)
+        if not checks.traced(self.model_data):
             self._trace = trace
         return trace
 
@@ -360,14 +401,14 @@ class BoundModel:
         return self._site_at(z, self._data_or_arguments(y)).distribution
 
     def _data_or_arguments(self, y: Any) -> Any:
-        return y if isinstance(y, ModelArguments) else self.data(y)
+        return y if isinstance(y, ModelArguments) else self._all_data(y)
 
     def _site_at(self, z: Any, y: Any) -> LikelihoodSite:
         """Return the likelihood site at parameters, with its observations."""
         traced = self.traced
         values = z if isinstance(z, Mapping) else traced.constrain(jnp.asarray(z, float), y)
         values = {name: values[name] for name in self.sites if name in values}
-        return likelihood_site(traced.with_times(y), *traced.call(y), traced.key, values)
+        return likelihood_site(traced.with_times(y), *traced.call(y), traced.key, values, self._selected)
 
     def filter(self, z: ArrayLike | Mapping[str, Any], y: ArrayLike | None = None) -> FilterResult:
         """Return the result of the Gaussian filter at parameters z (d,), or site name -> value; see `lfm_ppl.filter`.
@@ -405,7 +446,7 @@ class BoundModel:
 
         if times is None:
             return self.program("smooth", lambda: eqx.filter_jit(run))(_as_arrays(z), self._arguments(y))
-        data = self.data(y)
+        data = self._all_data(y)
         return self.compiled(("smooth", signature(times)), lambda: eqx.filter_jit(run))(
             _as_arrays(z), None if self.argument is None else data)
 
@@ -419,24 +460,32 @@ class BoundModel:
         """Return the model with fixed parameters; see `lfm_ppl.fix`, with the outputs as labels."""
         if not values:
             return self
-        labels = self.site.example.ssm.model.output_names
+        # Elements are named by outputs, which differ between sites.
+        labels = () if self.is_by_site else self.site.example.ssm.model.output_names
         return self._modified(("fix", signature(dict(values))), lambda model: fix(model, values, labels=labels))
 
     def approximate(self, **settings: Any) -> BoundModel:
-        """Return the model with other settings of its likelihood, such as ``steps``."""
-        return self._modified(("approximate", signature(settings)), lambda model: approximate(model, **settings))
+        """Return the model with other settings of its likelihood, such as ``steps``; only of the selected site."""
+        def modify(model: Callable) -> Callable:
+            handler = approximate(model, **settings)
+            handler.only_site = self._selected
+            return handler
+
+        return self._modified(("approximate", signature(settings)), modify)
 
     def _modified(self, name: tuple[str, Hashable], modify: Callable[[Callable], Callable]) -> BoundModel:
         traced = self.traced
 
         def trace_modified() -> TracedModel:
-            modified = TracedModel(modify(traced.model), traced.arguments, traced.data_index, traced.keywords, self.y,
-                                   traced.caller)
-            return modified.share_programs(traced.identity and (traced.identity, name)) if is_cached else modified
+            modified = TracedModel(modify(traced.model), traced.arguments, traced.data_index, traced.keywords,
+                                   self.model_data, traced.caller)
+            identity = traced.identity and (traced.identity, self._selected, name)
+            return modified.share_programs(identity) if is_cached else modified
 
         with jax.ensure_compile_time_eval():  # the call may come from compiled code
-            is_cached = name[1] is not None and not checks.traced(self.y)
-            return BoundModel(traced.memoized(name, trace_modified) if is_cached else trace_modified(), self.y)
+            is_cached = name[1] is not None and not checks.traced(self.model_data)
+            modified = traced.memoized((self._selected, *name), trace_modified) if is_cached else trace_modified()
+        return BoundModel(modified, self.model_data, self._selected)
 
     def compiled(self, name: Hashable, make: Callable[[], Callable]) -> Callable:
         """Return the function of this name, for any data, made at the first call for these times and inputs.
@@ -445,7 +494,7 @@ class BoundModel:
             name: everything that the function depends on besides the model and its arguments.
             make: returns the function; the data must be an argument of it.
         """
-        return self.traced.memoized(name, make)
+        return self.traced.memoized((self._selected, name), make)
 
     def program(self, name: Hashable, make: Callable[[], Any]) -> Any:
         """Return the function of this name, for any data, times and inputs; made at the first call.
@@ -454,7 +503,7 @@ class BoundModel:
             name: everything that the function depends on besides the model and its arguments.
             make: returns the function, which takes `arguments` and takes data, times and inputs from there only.
         """
-        return self.traced.program(name, make)
+        return self.traced.program((self._selected, name), make)
 
 
 def _as_arrays(z: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -37,14 +37,14 @@ class LikelihoodSite(NamedTuple):
 
 
 def likelihood_site(model: Callable, arguments: tuple, keywords: Mapping[str, Any], key: jax.Array,
-                    parameters: Mapping[str, Any] | None = None) -> LikelihoodSite:
-    """Run a NumPyro model and return its likelihood site.
+                    parameters: Mapping[str, Any] | None = None, name: str | None = None) -> LikelihoodSite:
+    """Run a NumPyro model and return its likelihood site, of several the one with this name.
 
     Raises:
-        ValueError: the model has no such site, or several.
+        ValueError: the model has no such site, or several and no name is given.
     """
     seeded = handlers.seed(handlers.substitute(model, data=dict(parameters or {})), key)
-    return single_site(likelihood_sites(handlers.trace(seeded).get_trace(*arguments, **keywords)))
+    return single_site(likelihood_sites(handlers.trace(seeded).get_trace(*arguments, **keywords)), name)
 
 
 def likelihood_sites(trace: Mapping[str, Any]) -> list[LikelihoodSite]:
@@ -60,17 +60,22 @@ def likelihood_sites(trace: Mapping[str, Any]) -> list[LikelihoodSite]:
     return sites
 
 
-def single_site(sites: list[LikelihoodSite]) -> LikelihoodSite:
-    """Return the only likelihood site.
+def single_site(sites: Sequence[LikelihoodSite], name: str | None = None) -> LikelihoodSite:
+    """Return the only likelihood site, or the one with this name.
 
     Raises:
-        ValueError: there are none, or several.
+        ValueError: there is no such site, or there are several and no name is given.
     """
-    if len(sites) != 1:
-        names = ", ".join(site.name for site in sites) or "none"
-        raise ValueError("the model must have exactly one site numpyro.sample(name, lfm.MarginalLikelihood(...), "
-                         f"obs=y) (or lfm.panel); found {names}.")
-    return sites[0]
+    selected = [site for site in sites if name in (None, site.name)]
+    if len(selected) == 1:
+        return selected[0]
+    names = ", ".join(site.name for site in sites) or "none"
+    if not selected:
+        raise ValueError("the model must have a site numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) (or "
+                         f"lfm.panel){'' if name is None else f' with the name {name!r}'}; found {names}.")
+    raise ValueError(f"one likelihood site is expected here, and the model has {names}: pass times and data by site, "
+                     f"lfm.fit(model, {{{', '.join(f'{site.name!r}: (times, y)' for site in sites)}}}), which calls "
+                     f"model(times, y) with dicts; of a bound model take bound.site_models[{sites[0].name!r}].")
 
 
 class SiteTimes(NamedTuple):

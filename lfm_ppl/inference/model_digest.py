@@ -35,7 +35,7 @@ def model_digest(bound: BoundModel) -> str | None:
     if bound.argument is None:
         return None
     medians = jnp.asarray(bound.draw(jax.random.key(0)))
-    times = np.unique(bound.times)
+    times = np.unique(np.concatenate([np.ravel(part) for part in jax.tree.leaves(bound.times)]))
     selection = np.unique(np.linspace(0, len(times) - 1, _TIMES).round().astype(int))
     evaluate, recorder = bound.program("digest", lambda: _digest_program(bound))
     digest = hashlib.sha256(repr((bound.names, bound.size)).encode())

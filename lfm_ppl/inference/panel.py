@@ -22,7 +22,7 @@ from lfm_ppl.filtering.arguments import as_rule
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood, refuse_times_by_site, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -48,6 +48,7 @@ class Panel(dist.Distribution):
             shapes = [np.shape(leaf) for leaf in leaves]
             raise ValueError("every array in parameters needs the same leading axis, one entry a series; got "
                              f"{shapes}. Repeat a shared parameter with jnp.broadcast_to, or close over it in build.")
+        refuse_times_by_site(times)
         self.build, self.parameters, self.times, self.settings = build, parameters, times, settings
         (count,) = sizes
         if self._has_series_times and np.shape(times)[0] != count:

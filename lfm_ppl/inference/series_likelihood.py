@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -65,6 +65,7 @@ class SeriesLikelihood(dist.Distribution):
     layout: GridLayout | None = None
 
     def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None, steps: int) -> None:
+        refuse_times_by_site(times)
         self.model, self.times, self.rule, self.steps = model, times, as_rule(rule), steps
         concrete_times = checks.concrete(times)
         if concrete_times is None:
@@ -237,6 +238,14 @@ class SeriesLikelihood(dist.Distribution):
         if self.iterations:
             points = posterior_linearisation(problem, updater, self.iterations, self.damping).points
         return at_intervals(forward(problem, updater, about=points).log_likelihood, self.time_grid.observed)
+
+
+def refuse_times_by_site(times: Any) -> None:
+    """Raise TypeError for the times of several sites in the place of those of one."""
+    if isinstance(times, Mapping):
+        name = next(iter(times), "y")
+        raise TypeError(f"times must be those of one site, got a dict of {', '.join(map(str, times)) or 'none'}: write "
+                        f"times[{name!r}], and obs=y[{name!r}].")
 
 
 def repeat_draw(draw: Callable[[jax.Array], jax.Array], key: jax.Array, sample_shape: tuple[int, ...]) -> jax.Array:

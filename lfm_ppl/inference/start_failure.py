@@ -60,17 +60,19 @@ def _format_array(value: Any) -> str:
 
 
 def _likelihood_failure(bound: BoundModel, z: Any) -> str | None:
-    """Return a sentence on the series and the row at which the likelihood fails."""
-    distribution = bound.likelihood(z)
-    is_panel = isinstance(distribution, Panel)
-    for index in range(distribution.batch_shape[0] if is_panel else 1):
-        member = distribution.series(index) if is_panel else distribution
-        y = (bound.y[index] if is_panel else bound.y).reshape(member.event_shape)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the same reasons, as warnings
-            if np.isfinite(member.log_prob(y)):
-                continue
-        return (f"series {index}: " if is_panel else "") + _series_failure(member, y)
+    """Return a sentence on the site, the series and the row at which the likelihood fails."""
+    for name, site_model in bound.site_models.items():
+        distribution, y = site_model.likelihood(z), site_model.y
+        is_panel = isinstance(distribution, Panel)
+        for index in range(distribution.batch_shape[0] if is_panel else 1):
+            member = distribution.series(index) if is_panel else distribution
+            rows = (y[index] if is_panel else y).reshape(member.event_shape)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the same reasons, as warnings
+                if np.isfinite(member.log_prob(rows)):
+                    continue
+            return ((f"site {name!r}: " if bound.is_by_site else "") + (f"series {index}: " if is_panel else "")
+                    + _series_failure(member, rows))
     return None
 
 

@@ -77,6 +77,7 @@ class TracedModel:
         sites: names of the latent sites.
         names: names of the unconstrained coordinates.
         size: number of unconstrained coordinates d.
+        likelihoods: the likelihood sites at the prior's medians, without observations.
         sites_of_times: names of likelihood sites that observe the times instead of the data.
         functions: name -> compiled function, or another object that depends on this model alone.
         identity: key of the model function; None where its programs are not shared.
@@ -99,7 +100,7 @@ class TracedModel:
         likelihoods = likelihood_sites(trace)
         self.sites_of_times = [site.name for site in likelihoods if arguments and _equals(site.observed, arguments[0])
                                and not _contains(data, arguments[0])]
-        self._likelihoods = [site._replace(observed=None) for site in likelihoods]
+        self.likelihoods = tuple(site._replace(observed=None) for site in likelihoods)
         position = _unconstrained(latent_sites(trace))
         self.sites = tuple(position)
         self.names = coordinate_names(position)
@@ -140,7 +141,7 @@ class TracedModel:
             values = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype) if checks.traced(leaf) else leaf, data)
             recorded = self._recorded(_measure, self._seeded, lambda run, *point: jax.jvp(run, point, point), z, values)
         self._structures = [structure for _, _, structure in recorded.values()]
-        for site in self._likelihoods:
+        for site in self.likelihoods:
             traced_times, layout, _ = recorded.get(site.name, (None, None, None))
             if not checks.traced(traced_times):
                 times[site.name] = SiteTimes(site.distribution.times, None if checks.traced(layout) else layout)
@@ -170,7 +171,7 @@ class TracedModel:
 
     def lay_out(self, at: np.ndarray) -> ModelInputs | None:
         """Return the layout with requested times (K,), an argument of programs; None where programs need the times."""
-        if self.inputs is None or len(self._likelihoods) != 1:
+        if self.inputs is None or len(self.likelihoods) != 1:
             return None
         (layout,) = self._recorded(lambda likelihood: likelihood.lay_out(at), self.with_times(self._example),
                                    jax.eval_shape, jnp.zeros(self.size), shapes(self._example)).values()
@@ -183,7 +184,7 @@ class TracedModel:
         likelihood is a panel or has constraints, where its times depend on parameters, or where the structure of the
         model depends on the values of its arguments.
         """
-        layouts = [self.site_times.get(site.name, SiteTimes(None)).layout for site in self._likelihoods]
+        layouts = [self.site_times.get(site.name, SiteTimes(None)).layout for site in self.likelihoods]
         if self.data_index is None or identity is None or not layouts or any(layout is None for layout in layouts):
             return self
         inputs = ModelInputs.of((self.arguments, self.keywords), {
@@ -210,10 +211,21 @@ class TracedModel:
             return False
         return list(traced.values()) == self._structures
 
-    @property
-    def site(self) -> LikelihoodSite:
-        """The likelihood site at the prior's medians."""
-        return single_site(self._likelihoods)
+    @functools.cached_property
+    def sites_of_other_data(self) -> list[str]:
+        """The names of likelihood sites whose observations are constants, where the data are an argument."""
+        names: list[str] = []
+
+        def run(y: Any) -> None:
+            names.extend(site.name for site in likelihood_sites(self.trace(y)) if not checks.traced(site.observed))
+
+        if self.data_index is not None:
+            jax.eval_shape(run, shapes(self._example))
+        return names
+
+    def site(self, name: str | None = None) -> LikelihoodSite:
+        """Return the likelihood site at the prior's medians, of several the one with this name."""
+        return single_site(self.likelihoods, name)
 
     def trace(self, y: Any) -> dict[str, Any]:
         """Return NumPyro's trace of the model at the prior's medians."""

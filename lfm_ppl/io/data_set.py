@@ -191,6 +191,12 @@ def model_keywords(tables: Mapping[str, InputTable], model_kwargs: Mapping[str, 
     return {**{name: value for name, value in from_data.items() if value}, **(model_kwargs or {})}
 
 
+def keywords_by_site(sites: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return keyword arguments that are dicts by likelihood site, from the keyword arguments for each site."""
+    names = {name: None for keywords in sites.values() for name in keywords}
+    return {name: {site: keywords.get(name, {}) for site, keywords in sites.items()} for name in names}
+
+
 def at_origin(data: Data, origin: str, unit: str) -> Data:
     """Return data, whose times were dates, with their times counted from another origin, in another unit."""
     ratio = calendar_time.SECONDS[data.units["time"]] / calendar_time.SECONDS[unit]

@@ -32,6 +32,7 @@ from lfm_ppl.results.approximation import more_iterations
 from lfm_ppl.results.likelihoods import LikelihoodProblem, Reference, ReferenceSettings
 from lfm_ppl.results.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.results.scalars import choose, scalar_draws
+from lfm_ppl.results.sites import select_site
 from lfm_ppl.results.verdict import NOISE_SD, NOISE_SHARE, Findings, judge
 from lfm_ppl.utils import checks
 
@@ -110,11 +111,12 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         raise ValueError("replicates must be at least 2: their spread estimates the noise of the particle filter.")
     _check_sampler(result)
     full_problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs)
-    if full_problem.example.constraints_in_words:
-        raise ValueError("a check of the Gaussian filter's accuracy does not support constraints, and the likelihood "
-                         f"has some: {full_problem.example.constraints_in_words}. Leave them out.")
-    ssm = full_problem.example.ssm
-    kind = _kind(reference, ssm)
+    examples = {name: site.example for name, site in full_problem.sites.items()}
+    for example in examples.values():
+        if example.constraints_in_words:
+            raise ValueError("a check of the Gaussian filter's accuracy does not support constraints, and the "
+                             f"likelihood has some: {example.constraints_in_words}. Leave them out.")
+    kinds = {name: _kind(reference, example.ssm) for name, example in examples.items()}
     posterior = arviz_data.group(result, "posterior")
     draw_index, rows = evenly_spaced(posterior.sizes["chain"], posterior.sizes["draw"], draws)
     run = None
@@ -122,30 +124,52 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         run = checkpoints.begin_or_resume(checkpoint, {
             "reference": reference, "draws": draws, "particles": particles, "replicates": replicates, "steps": steps,
             "seed": seed, "model": run_record.digest(model_digest(full_problem.bound)),
-            "data": run_record.digest(full_problem.y), "versions": run_record.versions(),
+            "data": run_record.digest(*(site.y for site in full_problem.sites.values())),
+            "versions": run_record.versions(),
             "draws of the result": run_record.digest(*full_problem.draws.values()),
         }, resume)  # fmt: skip
     with checkpoints.closing(run):
         problem = replace(full_problem.select(rows), stores=None if run is None else run.batches)
-        settings = ReferenceSettings(kind, particles, replicates, steps, seed, progress)
+        settings = {name: ReferenceSettings(kind, particles, replicates, steps, seed, progress)
+                    for name, kind in kinds.items()}
         report = _report(result, problem, draw_index, settings)
     arviz_data.add_group(result, GROUP, report.to_dataset())
     return report
 
 
 def _report(result: Any, problem: LikelihoodProblem, draw_index: np.ndarray,
-            settings: ReferenceSettings) -> AccuracyReport:
+            settings: Mapping[str, ReferenceSettings]) -> AccuracyReport:
     posterior = arviz_data.group(result, "posterior")
     shape = (posterior.sizes["chain"], len(draw_index))
-    filtered = likelihoods.gaussian(problem).reshape(shape)
-    rebuilding.check_likelihood(result, likelihoods.recorded(problem, filtered.ravel()).reshape(shape), draw_index)
-    doubled = likelihoods.gaussian_with_finer_steps(problem).reshape(shape)
-    iterated = None
-    if (refinement := more_iterations(problem.example)) is not None:
-        refined = replace(problem, bound=problem.bound.approximate(**refinement.settings))
-        iterated = likelihoods.gaussian(refined, "log likelihoods with more iterations").reshape(shape)
-    reference_values = _reference(problem, filtered, settings)
-    return assess(result, draw_index, filtered, doubled, reference_values, problem, iterated)
+    sites = problem.sites
+    filtered = {name: likelihoods.gaussian(site).reshape(shape) for name, site in sites.items()}
+    for name, site in sites.items():
+        site_result = select_site(result, name) if arviz_data.sites_of(result) else result
+        recorded = likelihoods.recorded(site, filtered[name].ravel()).reshape(shape)
+        rebuilding.check_likelihood(site_result, recorded, draw_index)
+    doubled = [likelihoods.gaussian_with_finer_steps(site).reshape(shape) for site in sites.values()]
+    iterated, refinements = dict(filtered), {name: more_iterations(site.example) for name, site in sites.items()}
+    for name, refinement in refinements.items():
+        if refinement is not None:
+            refined = replace(sites[name], bound=sites[name].bound.approximate(**refinement.settings))
+            iterated[name] = likelihoods.gaussian(refined, "log likelihoods with more iterations").reshape(shape)
+    references = {name: _reference(site, filtered[name], settings[name], len(sites)) for name, site in sites.items()}
+    return assess(result, draw_index, np.sum([*filtered.values()], axis=0), np.sum(doubled, axis=0),
+                  _of_all_sites(references), problem,
+                  np.sum([*iterated.values()], axis=0) if any(refinements.values()) else None)
+
+
+def _of_all_sites(references: Mapping[str, Reference]) -> Reference:
+    """Return the log likelihoods of the series of all sites."""
+    values = list(references.values())
+    descriptions = {name: reference.description for name, reference in references.items()}
+    shared = set(descriptions.values())
+    replicates = max(reference.estimates.shape[-1] for reference in values)
+    return Reference(
+        np.concatenate([np.broadcast_to(reference.estimates, (*reference.estimates.shape[:2], replicates))
+                        for reference in values], axis=1),
+        shared.pop() if len(shared) == 1 else "; ".join(map(": ".join, descriptions.items())),
+        max(reference.particles for reference in values), any(reference.limited for reference in values))
 
 
 def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
@@ -282,7 +306,9 @@ def _noisy(ssm: StateSpaceModel) -> bool:
     return callable(noise) or (noise is not None and bool(np.any(np.asarray(noise))))
 
 
-def _reference(problem: LikelihoodProblem, filtered: np.ndarray, settings: ReferenceSettings) -> Reference:
+def _reference(problem: LikelihoodProblem, filtered: np.ndarray, settings: ReferenceSettings,
+               count: int) -> Reference:
+    """Return the reference of one site of ``count``, whose noises add up."""
     if settings.kind == "none":
         return Reference(filtered.reshape(-1, 1, 1), f"{EXACT}: for this linear model the Gaussian filter is exact")
     if settings.kind == "grid":
@@ -297,7 +323,8 @@ def _reference(problem: LikelihoodProblem, filtered: np.ndarray, settings: Refer
         return importance.smooth(ratio, _relative_efficiency(filtered)).reliable or not is_noisy
 
     return likelihoods.by_particles(
-        problem, settings, lambda estimates: noise(_summed(estimates)), NOISE_SD, _MOST_WORK, is_settled)
+        problem, settings, lambda estimates: noise(_summed(estimates)), NOISE_SD / np.sqrt(count), _MOST_WORK,
+        is_settled)
 
 
 def _summed(estimates: np.ndarray) -> importance.Averaged:

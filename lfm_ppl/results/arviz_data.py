@@ -37,6 +37,9 @@ MODE = "mode"
 DEGENERATE = "degenerate_mode"
 """Attribute of a result of sampler "map": parameter -> entries at whose mode the density has a spike, as JSON."""
 
+LIKELIHOODS = "likelihood_sites"
+"""Attribute of a result with several likelihood sites: name -> its attributes that differ between sites, as JSON."""
+
 _SMALLEST_TAIL = 5
 """Fewest importance ratios that a Pareto distribution can be fitted to."""
 
@@ -106,6 +109,8 @@ def group(result: Any, name: str) -> xr.Dataset:
         ValueError: there is no such group; the message says how to get it.
     """
     if not has_group(result, name):
+        if any(f"{name}_{site.replace('/', '.')}" in groups(result) for site in sites_of(result)):
+            refuse_several_sites(result)
         remedy = _HOW_TO_GET.get(name)
         raise ValueError(
             f"the result has no group {name!r}; it has {', '.join(groups(result)) or 'none'}."
@@ -146,6 +151,18 @@ def attributes(result: Any) -> dict[str, Any]:
     """
     groups(result)  # which says what it is instead
     return dict(result.attrs)
+
+
+def sites_of(result: Any) -> dict[str, dict[str, Any]]:
+    """Return the likelihood sites of ``result`` with their attributes; none where times and data were not by site."""
+    return json.loads(str(attributes(result).get(LIKELIHOODS, "{}")))
+
+
+def refuse_several_sites(result: Any) -> None:
+    """Raise ValueError for a result with several likelihood sites, of which one has to be selected."""
+    if names := list(sites_of(result)):
+        raise ValueError(f"the result has the likelihood sites {', '.join(names)}, and this takes one; select it: "
+                         f"lfm.select_site(result, {names[0]!r}).")
 
 
 def save(result: Any, path: str | Path, overwrite: bool = False) -> Path:

@@ -49,6 +49,7 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
     """
     if trajectory_draws != 0:
         checks.positive_integer("trajectory_draws", trajectory_draws)
+    arviz_data.refuse_several_sites(result)
     report = AccuracyReport.of(result)
     if not report.reliable:
         raise ValueError(f"the importance weights cannot be relied on: Pareto k = {report.k:.2f}, not below "

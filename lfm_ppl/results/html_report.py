@@ -96,6 +96,7 @@ def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figur
     """
     path = Path(path) / NAME if Path(path).is_dir() else Path(path)
     refuse_existing(path, overwrite)
+    arviz_data.refuse_several_sites(result)
     attrs = arviz_data.attributes(result)
     table = tables.annotate(arviz_data.summary(result), result)
     pictures, failures = _draw_figures(result) if figures is None else (_read(figures), [])

@@ -74,8 +74,9 @@ class Labels:
         renamed = {plates[0]: series} if series is not None and len(plates) == 1 else {}
         dimensions: dict[str, tuple[str | None, ...]] = {}
         derived = set()
+        likelihoods = {likelihood.name for likelihood in bound.traced.likelihoods}
         for name, site_trace in trace.items():
-            if name == site.name or site_trace["type"] not in ("sample", "deterministic"):
+            if name in likelihoods or site_trace["type"] not in ("sample", "deterministic"):
                 continue
             derived |= {name} if site_trace["type"] == "deterministic" else set()
             dimensions[name] = _axes(site_trace, renamed)
@@ -179,7 +180,8 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
     which = {name: labels.coords[name] for name in panel}
     observed_coords = {**clock, **which, "output": named["output"]}
     groups = {
-        "posterior": _posterior(draws, coords, named, labels),
+        # Between sites, outputs differ: a parameter with an entry for each output of one site may belong to another.
+        "posterior": _posterior(draws, coords, {**named, OUTPUT: []} if bound.is_by_site else named, labels),
         "sample_stats": xr.Dataset({k: (("chain", "draw"), v) for k, v in stats.items()}, coords),
         "observed_data": xr.Dataset({site.name: variable((*along, "output"), y, named["output"])}, observed_coords),
     }

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
@@ -64,13 +65,23 @@ class LikelihoodProblem:
 
     @property
     def example(self) -> SeriesLikelihood:
-        """The likelihood of one series at parameters from the prior."""
-        return self.bound.site.example
+        """The likelihood of one series at parameters from the prior; of several sites, the first that is not exact."""
+        examples = [bound.site.example for bound in self.bound.site_models.values()]
+        return next((example for example in examples if not is_exact(example.ssm)), examples[0])
 
     @property
     def y(self) -> np.ndarray:
         """The data, (T, D), or (B, T, D) for a panel."""
         return np.asarray(self.bound.y)
+
+    @property
+    def sites(self) -> dict[str, LikelihoodProblem]:
+        """The same draws with one likelihood site selected, by name of the site."""
+        if not self.bound.is_by_site:
+            return {self.bound.site.name: self}
+        stores = self.stores
+        return {name: replace(self, bound=bound, stores=None if stores is None else functools.partial(
+            _site_store, stores, name)) for name, bound in self.bound.site_models.items()}
 
     @property
     def size(self) -> int:
@@ -85,6 +96,10 @@ class LikelihoodProblem:
     def select(self, rows: Any) -> LikelihoodProblem:
         """Return the same problem with some of the draws."""
         return replace(self, draws={name: value[rows] for name, value in self.draws.items()})
+
+
+def _site_store(stores: Callable[[str], BatchStore], site: str, name: str) -> BatchStore:
+    return stores(f"{name} of site {site}")
 
 
 @dataclass(frozen=True)

@@ -14,24 +14,27 @@ import xarray as xr
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.likelihood_site import LikelihoodSite
-from lfm_ppl.io.data_set import InputTable, as_doses, model_keywords
+from lfm_ppl.io.data_set import InputTable, as_doses, keywords_by_site, model_keywords
 from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.results.likelihoods import LikelihoodProblem
 from lfm_ppl.results.series import TIMES, times_of
+from lfm_ppl.results.sites import select_site
 
 _TOLERANCE = 1e-6
 """Relative difference of log likelihoods between machines and versions that is rounding."""
 
 
-def observations(result: Any) -> tuple[np.ndarray, np.ndarray]:
+def observations(result: Any) -> tuple[Any, Any]:
     """Return the times and the observations that ``result`` was made from.
 
     Returns:
-        times (T,) or (B, T), and y (T, D) or (B, T, D).
+        times (T,) or (B, T), and y (T, D) or (B, T, D); or dicts of them by site.
 
     Raises:
         ValueError: the result holds no data.
     """
+    if sites := {name: observations(select_site(result, name)) for name in arviz_data.sites_of(result)}:
+        return {name: times for name, (times, _) in sites.items()}, {name: y for name, (_, y) in sites.items()}
     data = arviz_data.group(result, "observed_data")
     names = [name for name in data.data_vars if name != TIMES]
     if len(names) != 1 or not {TIMES, "time"} & set(data.variables):
@@ -42,6 +45,9 @@ def observations(result: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def keywords(result: Any, later: Mapping[str, Any] | None, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the keyword arguments of a result's model with known inputs that reach further; see `lfm_ppl.forecast`."""
+    if sites := arviz_data.sites_of(result):
+        return keywords_by_site({name: keywords(select_site(result, name), (later or {}).get(name), None)
+                                 for name in sites}) | dict(overrides or {})
     stored = inputs.inputs_of(result)
     doses = {name: InputTable(*value) for name, value in (later or {}).items()
              if name in stored and stored[name].dosed_state}
@@ -78,7 +84,9 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
             raise
         example = ", ".join(f"{name!r}: ..." for name in missing)
         raise TypeError(f"the model needs {', '.join(missing)}: pass model_kwargs={{{example}}}.") from error
-    _check_settings(bound.site, attrs)
+    settings = arviz_data.sites_of(result)
+    for name, site_model in bound.site_models.items():
+        _check_settings(site_model.site, settings.get(name, {}) if settings else attrs)
     bound = bound.fix(json.loads(attrs.get("fixed") or "{}"))
     return LikelihoodProblem(bound, _latent(bound, posterior))
 

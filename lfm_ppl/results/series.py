@@ -45,7 +45,7 @@ def plate_dimension(bound: BoundModel) -> str | None:
 
 def series_dimension(result: Any) -> str | None:
     """Return the dimension of the series of a result; None where it is of one series."""
-    if not arviz_data.has_group(result, "observed_data"):
+    if not arviz_data.has_group(result, "observed_data") or arviz_data.sites_of(result):
         return None
     dims = arviz_data.group(result, "observed_data").dims
     return next((str(name) for name in dims if name not in _OTHER_DIMENSIONS), None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.posterior import noise_of_rows
-from lfm_ppl.io.data_set import Data, at_origin, model_keywords
+from lfm_ppl.io.data_set import Data, at_origin, keywords_by_site, model_keywords
 from lfm_ppl.utils import calendar_time, checks
 
 
@@ -51,6 +51,92 @@ def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
     times = np.asarray(times) * (data_seconds / model_seconds)
     data = None if data is None else at_origin(data, origin, model_unit)
     return bind_in(origin, model_unit), data, (origin, model_unit)
+
+
+def data_by_site(times: Any, y: Any) -> dict[str, Any] | None:
+    """Return the data of each likelihood site, from a dict of data or from two dicts; None for data of one site."""
+    if not isinstance(times, Mapping) or not times:
+        return None
+    if isinstance(y, Mapping):
+        return {name: (values, y.get(name)) for name, values in times.items()}
+    # A dict of columns is a table, of one site.
+    is_of_site = [isinstance(value, Data) or isinstance(value, tuple) and len(value) == 2 and np.ndim(value[0]) > 0
+                  for value in times.values()]
+    return dict(times) if y is None and all(is_of_site) else None
+
+
+def of_site(argument: str, value: Any, name: str, sites: Collection[str]) -> Any:
+    """Return an argument for one site of several, which may be a dict by site; None where the site has no entry."""
+    if not sites or not isinstance(value, Mapping):
+        return value
+    for site in value:
+        if site not in sites:
+            raise ValueError(f"{argument}: {checks.unknown('likelihood site', site, sites)}")
+    return value.get(name)
+
+
+def coords_of_site(coords: Mapping[str, Any] | None, name: str, sites: Collection[str]) -> dict[str, Any]:
+    """Return the labels of the dimensions of a site of several, ``y_output`` as ``output``, without other sites'."""
+    if not sites:
+        return dict(coords or {})
+    prefix, other_prefixes = f"{name}_", tuple(f"{site}_" for site in sites if site != name)
+    return {dim.removeprefix(prefix): labels for dim, labels in (coords or {}).items()
+            if dim.startswith(prefix) or not dim.startswith(other_prefixes)}
+
+
+def bind_sites(numpyro_model: Callable, sites: Mapping[str, Any], model_kwargs: Mapping[str, Any] | None
+               ) -> tuple[BoundModel, dict[str, Any], tuple[str | None, str]]:
+    """Bind a model with several likelihood sites to its data, with dates of all sites on one clock.
+
+    Args:
+        numpyro_model: the model.
+        sites: name of the site -> `Data` or a pair of times and observations.
+        model_kwargs: keyword arguments of the model, without the known inputs of the data.
+
+    Returns:
+        The bound model; the data of each site, `Data` or a pair; the clock, as `bind_dates`.
+    """
+    pairs = [name for name, value in sites.items() if not isinstance(value, Data)]
+    sites = {name: _dated(*value) if name in pairs else value for name, value in sites.items()}
+    origins = [value.origin for value in sites.values() if isinstance(value, Data) and value.origin is not None]
+    if len(origins) < len(sites):
+        if origins:
+            raise ValueError("the times of some sites are dates and the others are numbers: give dates for all sites, "
+                             "or numbers for all.")
+        return _bind_sites(numpyro_model, sites, model_kwargs), sites, (None, "")
+    unit = next(iter(sites.values())).units["time"]
+    origin = origins[int(np.argmin([calendar_time.positions("times", other, origins[0], unit) for other in origins]))]
+
+    def bind_in(unit: str) -> tuple[BoundModel, dict[str, Any], tuple[str | None, str]]:
+        on_clock: dict[str, Any] = {name: at_origin(value, origin, unit) for name, value in sites.items()}
+        on_clock |= {name: (on_clock[name].times, on_clock[name].y) for name in pairs}
+        with calendar_time.in_messages(origin, unit):
+            return _bind_sites(numpyro_model, on_clock, model_kwargs), on_clock, (origin, unit)
+
+    bound, data, clock = bind_in(unit)
+    # A model names its unit only once it has been built, which needs times.
+    units = [model.site.example.ssm.model.units.get("time") for model in bound.site_models.values()]
+    model_unit = next((name for name in units if name in calendar_time.SECONDS), unit)
+    return (bound, data, clock) if model_unit == unit else bind_in(model_unit)
+
+
+def _dated(times: Any, y: Any) -> Data | tuple[Any, Any]:
+    """Return times and observations, as `Data` where times are dates."""
+    checks.refuse_durations("times", times)
+    y = y.to_numpy(float) if hasattr(y, "to_numpy") else y
+    if not calendar_time.holds_dates(times):
+        return times, y
+    columns = np.asarray(checks.unmask(y), float).reshape(len(times), -1)
+    return Data(times, columns, tuple(map(str, range(columns.shape[1]))))
+
+
+def _bind_sites(numpyro_model: Callable, sites: Mapping[str, Any],
+                model_kwargs: Mapping[str, Any] | None) -> BoundModel:
+    pairs = {name: (value.times, value.y) if isinstance(value, Data) else value for name, value in sites.items()}
+    keywords = keywords_by_site({name: model_keywords(value.inputs, None) if isinstance(value, Data) else {}
+                                 for name, value in sites.items()})
+    times, y = ({name: pair[index] for name, pair in pairs.items()} for index in (0, 1))
+    return _bind(numpyro_model, times, y, keywords | dict(model_kwargs or {}))
 
 
 def _bind(numpyro_model: Callable, times: Any, y: Any, model_kwargs: dict[str, Any]) -> BoundModel:

@@ -13,11 +13,13 @@ be resumed.
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,18 +46,28 @@ from lfm_ppl.results.series import SERIES
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import waiting
 from lfm_ppl.utils.types import Result, Times
-from lfm_ppl.workflows.data_binding import bind_dates, check_requested_times, warn_of_missing_predictions
+from lfm_ppl.workflows.data_binding import (
+    bind_dates,
+    bind_sites,
+    check_requested_times,
+    coords_of_site,
+    data_by_site,
+    of_site,
+    warn_of_missing_predictions,
+)
 from lfm_ppl.workflows.fit_options import (
     FitOptions,
     check_sizes,
     describe_assumptions,
     describe_priors,
+    likelihood_settings,
     model_docstring,
 )
 from lfm_ppl.workflows.fit_results import (
     FitProblem,
     PosteriorDraws,
     PostProcessing,
+    SiteProblem,
     best_effort,
     build_result,
     note_warnings,
@@ -104,12 +116,14 @@ def fit(
 
     Args:
         numpyro_model: ``model(times, y=None, **model_kwargs)`` with one site
-            ``numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y)``, or a `lfm.panel` in a plate.
+            ``numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y)``, or a `lfm.panel` in a plate; or with several
+            sites, which read their own times and data, ``lfm.MarginalLikelihood(system, times["a"])``, ``obs=y["a"]``.
         times: (T,), non-decreasing. Or, without ``y``, times and observations together: `lfm.Data`, a DataFrame of
             pandas or polars or an xarray Dataset (see `lfm.read_table`); the model then gets the known inputs as its
             argument ``inputs``. Dates (``datetime64``, a DatetimeIndex, ...) become numbers that count from the
             midnight before the first date, in the unit that the model names (``units={"time": "h"}``), else in the unit
-            of the time between rows.
+            of the time between rows. For several likelihood sites a dict of these by name, ``{"a": data, "b": (times,
+            y)}``: the model gets dicts of times, of y and of known inputs, and all dates count from one midnight.
         y: (T, D), NaN or masked where missing; (B, T, D) for a panel.
         sampler: "nuts", "ram" (robust adaptive Metropolis), "pmmh" (particle-marginal RAM: a particle filter estimates
             the likelihood, and the posterior is exact up to its integration steps), or "map" (posterior mode; the draws
@@ -122,7 +136,8 @@ def fit(
         seed: seed of all random numbers.
         at: times of the trajectories, and of new observations; by default a grid over the data. Times after the last
             observation are forecasts, see `forecast`. (B, K) for series that have their own times. Dates where the
-            times of the data are dates; numbers are in the unit of the `lfm.Data`, or else of the model.
+            times of the data are dates; numbers are in the unit of the `lfm.Data`, or else of the model. A dict by site
+            where the sites need different times.
         trajectory_draws: number of posterior draws, spread over the chains, that get a trajectory; 0: none.
         model_kwargs: keyword arguments of the model. A second fit of the model to other data, times, known inputs and
             real arrays of the same shapes compiles nothing, with the exceptions of `lfm.bind`.
@@ -138,7 +153,7 @@ def fit(
         chain_method: "parallel", "vectorized" or "sequential"; by default parallel where there are as many devices as
             chains (``numpyro.set_host_device_count(chains)`` before JAX starts), sequential otherwise.
         progress: show the progress on standard error: a bar, or a line every 30 s where there is no terminal.
-        truth: true values of simulated data (``lfm.Data.truth``), stored in the result for plots.
+        truth: true values of simulated data (``lfm.Data.truth``), stored in the result for plots; a dict by site.
         name: name of the model in the result.
         checkpoint: folder that stores the run: the state of the chains and their draws, written every few seconds, and
             ``posterior.nc`` with the draws so far and at the end with the complete result. A killed process loses the
@@ -152,7 +167,8 @@ def fit(
             ``event_dims`` of NumPyro's ``infer``, and "output" for a vector with one entry for each output.
         coords: dimension -> labels, ``{"gene": ["CDKN1A", "SESN1"]}``, also of the dimension "output" (columns of y)
             and of the plate of a panel, whose name is the dimension of the series. By default the column names of a
-            data frame are the labels of "output", and series have the labels of an xarray DataArray, or numbers.
+            data frame are the labels of "output", and series have the labels of an xarray DataArray, or numbers. With
+            several likelihood sites the dimensions of one are "a_output" and so on.
 
     Ctrl-C ends the sampling after the present block of steps, about two seconds. With a ``checkpoint`` the finished
     draws are returned, with an attribute ``partial`` and a warning; without one they are the attribute ``result`` of
@@ -177,6 +193,11 @@ def fit(
           ``az.plot_ppc_pit(result.sel(output="a", draw=result["trajectories"]["draw"]))`` on ArviZ 1.x;
         - ``predictions``: with ``at``, new observations at these times, with noise; see `forecast`;
         - ``observed_data``, and ``truth`` and ``constant_data`` (known inputs) if there are any.
+
+        With several likelihood sites ``log_likelihood``, ``observed_data`` and ``posterior_predictive`` have a variable
+        for each, with dimensions of its own (``a_time``, ``a_output``), and the groups ``one_step_ahead``,
+        ``trajectories``, ``predictions``, ``truth`` and ``constant_data`` have its name: ``trajectories_a``.
+        `lfm.select_site` returns the part of one site as a result of one site, for figures, scores and tables.
 
     Raises:
         ValueError, TypeError: unknown sampler, wrong shapes, unknown parameters in ``fixed``, and so on; other model,
@@ -215,27 +236,31 @@ def fit(
         raise ValueError("resume continues a run that is stored in a folder; name the folder, checkpoint=...")
     if checkpoint is not None:
         checkpoints.check_folder(checkpoint, resume, overwrite)
-    data, unit = None, times.units.get("time") if isinstance(times, Data) else None
-    if y is None:
-        data = as_data(times)
-        times, y = data.times, data.y
-        coords = {"output": data.outputs, **({SERIES: data.series} if data.series else {}), **(coords or {})}
-    bound, data, clock = bind_dates(numpyro_model, times, y, data, model_kwargs)
-    if data is not None:
-        truth = data.truth if truth is None else truth
-        model_kwargs = model_keywords(data.inputs, model_kwargs)
-    if calendar_time.holds_dates(at):
-        at = calendar_time.positions("at", at, *clock)
-    elif at is not None and unit is not None and unit != clock[1]:  # numbers in the unit of the user's data
-        checks.refuse_durations("at", at)
-        at = np.asarray(at, float) * (calendar_time.SECONDS[unit] / calendar_time.SECONDS[clock[1]])
-    with calendar_time.in_messages(*clock):
-        check_requested_times(bound, at)
-        warn_of_missing_predictions(bound, at)
-    labels = Labels.of(bound, dims, coords, y)
-    truth = checked_truth(bound, truth, labels)
+    passed = data_by_site(times, y)
+    if passed is None:
+        table = as_data(times) if y is None else None
+        pair = (times, y) if table is None else (table.times, table.y)
+        bound, data, clock = bind_dates(numpyro_model, pair[0], pair[1], table, model_kwargs)
+        if data is not None:
+            model_kwargs = model_keywords(data.inputs, model_kwargs)
+        value = times if isinstance(times, Data) else pair
+        sites = {bound.site.name: _site_problem(bound, value, data, clock, at, truth, dims, coords)}
+    elif sampler == "pmmh":
+        raise ValueError("sampler 'pmmh' takes a model with one likelihood site, and there are data of "
+                         f"{', '.join(passed)}; take 'nuts' or 'ram'.")
+    else:
+        bound, on_clock, clock = bind_sites(numpyro_model, passed, model_kwargs)
+        sites = {name: _site_problem(bound.site_models[name], value, on_clock[name], clock,
+                                     of_site("at", at, name, passed), of_site("truth", truth, name, passed), dims,
+                                     coords_of_site(coords, name, passed)) for name, value in passed.items()}
     digest = None if checkpoint is None else model_digest(bound)
     bound = bound.fix(fixed)
+    sites = {name: replace(sites[name], bound=site_model, description={
+        **likelihood_settings(site_model.site.example),
+        "assumptions": best_effort("the model in words", functools.partial(describe_assumptions, site_model), None),
+    }) for name, site_model in bound.site_models.items()}
+    requested = {name: site.requested_times for name, site in sites.items()}
+    at = None if at is None else requested if bound.is_by_site else requested[bound.site.name]
     if sampler == "map":
         chains, warmup, thin, chain_method = 1, 0, None, None
     else:
@@ -246,11 +271,11 @@ def fit(
     title = str(name or getattr(numpyro_model, "__name__", "model"))
     description = {
         "model": title, "description": model_docstring(numpyro_model),
-        "call": options.call(title, "times, y" if data is None else "data", model_kwargs),
+        "call": options.call(title, "times, y" if y is not None else "data", model_kwargs),
         **options.description(bound),
         "priors": best_effort("priors in words", lambda: describe_priors(bound), None),
-        "assumptions": best_effort("the model in words", lambda: describe_assumptions(bound), None)}
-    problem = FitProblem(bound, options, labels, data, clock, truth, description, dict(attributes or {}), start_time)
+        "assumptions": None if bound.is_by_site else sites[bound.site.name].description["assumptions"]}
+    problem = FitProblem(bound, sites, options, description, dict(attributes or {}), start_time)
     store = None
     if checkpoint is not None:
         record = options.record(bound, digest)
@@ -280,6 +305,29 @@ def fit(
         checks.warn(message, ApproximationWarning)
     warn_of_convergence(convergence_warnings)
     return result
+
+
+def _site_problem(bound: BoundModel, passed: Data | tuple, data: Any, clock: tuple[str | None, str], at: Any,
+                  truth: Mapping[str, Any] | None, dims: Mapping[str, Sequence[str]] | None,
+                  coords: Mapping[str, Sequence[Any]] | None) -> SiteProblem:
+    """Check the arguments of `fit` on one likelihood site; ``passed`` are its data, and ``data`` these on the clock."""
+    unit = passed.units.get("time") if isinstance(passed, Data) else None
+    data = data if isinstance(data, Data) else None
+    if clock[0] is None and unit:  # numbers are not converted to a common unit
+        clock = None, unit
+    if calendar_time.holds_dates(at):
+        at = calendar_time.positions("at", at, *clock)
+    elif at is not None and unit is not None and unit != clock[1]:  # numbers in the unit of the user's data
+        checks.refuse_durations("at", at)
+        at = np.asarray(at, float) * (calendar_time.SECONDS[unit] / calendar_time.SECONDS[clock[1]])
+    with calendar_time.in_messages(*clock):
+        check_requested_times(bound, at)
+        warn_of_missing_predictions(bound, at)
+    if data is not None:
+        coords = {"output": data.outputs, **({SERIES: data.series} if data.series else {}), **(coords or {})}
+    labels = Labels.of(bound, dims, coords, None if isinstance(passed, Data) else passed[1])
+    truth = data.truth if truth is None and data is not None else truth
+    return SiteProblem(bound, labels, at, data, clock, checked_truth(bound, truth, labels))
 
 
 class _StoppedError(KeyboardInterrupt):

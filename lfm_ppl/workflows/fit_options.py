@@ -17,6 +17,7 @@ from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.priors import assumptions, prior_interval, without_parameters
 from lfm_ppl.inference.samplers import SAMPLERS
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.results import run_record
 from lfm_ppl.utils import checks
 
@@ -33,7 +34,7 @@ class FitOptions:
         thin: steps of one draw; None for "map".
         seed: of all random numbers.
         fixed: name -> value of the fixed parameters.
-        requested_times: times of the trajectories, the argument ``at``; None: a grid over the data.
+        requested_times: times of the trajectories, the argument ``at``; None: a grid over the data; a dict by site.
         trajectory_draws: number of draws with a trajectory.
         init: starting points.
         sampler_options: arguments of the sampler's kernel.
@@ -73,26 +74,28 @@ class FitOptions:
 
     def description(self, bound: BoundModel) -> dict[str, Any]:
         """Return the attributes of the result on the likelihood and the sampler."""
-        example = bound.site.example
+        likelihood = (likelihood_settings(bound.site.example) if not bound.is_by_site else
+                      {"likelihood": "; ".join(f"{name}: {site_model.site.example.description}"
+                                               for name, site_model in bound.site_models.items())})
+        if self.sampler == "pmmh":
+            likelihood["likelihood"] = "estimated without bias (particle filter)"
         return {
-            **example.recorded_settings, "sampler": self.sampler,
-            "likelihood": ("estimated without bias (particle filter)" if self.sampler == "pmmh"
-                           else example.description),
-            "seed": self.seed, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,
-            "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in self.fixed.items()}),
-            **({"sites": example.sites_in_words} if example.sites_in_words else {}),
-            **({"constraints": example.constraints_in_words} if example.constraints_in_words else {}),
+            **likelihood, "sampler": self.sampler, "seed": self.seed, "chains": self.chains, "warmup": self.warmup,
+            "samples": self.samples, "fixed": json.dumps({k: np.asarray(v).tolist() for k, v in self.fixed.items()}),
         }  # fmt: skip
 
     def record(self, bound: BoundModel, model_digest: Any) -> dict[str, Any]:
         """Return the settings that a run must share with the run that it resumes."""
         times = self.requested_times
+        parts = list(times.values()) if isinstance(times, Mapping) else [times]
         return {
             **self.description(bound), "thin": self.thin, "chain_method": self.chain_method, "init": self.init,
             "sampler_options": self.sampler_options, "trajectory_draws": self.trajectory_draws,
             "parameters": bound.names, "model": run_record.digest(model_digest),
-            "times": run_record.digest(bound.times), "data": run_record.digest(bound.y),
-            "times of the trajectories": None if times is None else run_record.digest(np.asarray(times, float)),
+            "times": run_record.digest(*jax.tree.leaves(bound.times)),
+            "data": run_record.digest(*jax.tree.leaves(bound.y)),
+            "times of the trajectories": None if times is None else run_record.digest(
+                *(part if part is None else np.asarray(part, float) for part in parts)),
             "versions": run_record.versions(),
         }  # fmt: skip
 
@@ -109,6 +112,15 @@ class FitOptions:
         objects = [f"{name}={name}" for name, value in (("at", self.requested_times), ("model_kwargs", model_kwargs))
                    if value is not None]
         return f"lfm.fit({', '.join([model, data, *values, *objects])})"
+
+
+def likelihood_settings(example: SeriesLikelihood) -> dict[str, Any]:
+    """Return the attributes of a result on the likelihood of one site."""
+    return {
+        **example.recorded_settings, "likelihood": example.description,
+        **({"sites": example.sites_in_words} if example.sites_in_words else {}),
+        **({"constraints": example.constraints_in_words} if example.constraints_in_words else {}),
+    }  # fmt: skip
 
 
 def check_sizes(sampler: str, chains: int, warmup: int | None, samples: int, thin: int | None,

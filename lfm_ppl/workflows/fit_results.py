@@ -18,6 +18,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import jax
@@ -36,6 +37,7 @@ from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, TrajectoryDraws, force_periods, lay_out
 from lfm_ppl.results.predictions import SHOWN_PERIODS, repeats_often
+from lfm_ppl.results.sites import merge_sites
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
@@ -57,27 +59,44 @@ class ConvergenceWarning(UserWarning):
 
 
 @dataclass(frozen=True)
-class FitProblem:
-    """A model with its data, and the options and labels of its fit.
+class SiteProblem:
+    """A likelihood site with its data, and the labels of its groups of the result.
 
     Attributes:
-        bound: the model with its data, without the fixed parameters.
-        options: of the fit.
+        bound: the model with its data, without the fixed parameters, and with the site selected.
         labels: names of dimensions and entries.
+        requested_times: times of the trajectories; None: a grid over the data.
         data: the data with known inputs; None where times and observations were passed themselves.
         clock: calendar time of t = 0 (None where times are plain numbers), and unit of time.
         truth: of simulated data.
+        description: attributes on the likelihood of the site.
+    """
+
+    bound: BoundModel
+    labels: Labels
+    requested_times: Any = None
+    data: Data | None = None
+    clock: tuple[str | None, str] = (None, "")
+    truth: Mapping[str, Any] | None = None
+    description: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FitProblem:
+    """A model with its data, and the options of its fit.
+
+    Attributes:
+        bound: the model with its data, without the fixed parameters.
+        sites: its likelihood sites by name.
+        options: of the fit.
         description: attributes of the result that do not depend on the draws.
         user_attributes: further attributes; they replace others of the same name.
         start_time: of `time.perf_counter`.
     """
 
     bound: BoundModel
+    sites: Mapping[str, SiteProblem]
     options: FitOptions
-    labels: Labels
-    data: Data | None
-    clock: tuple[str | None, str]
-    truth: Mapping[str, Any] | None
     description: dict[str, Any]
     user_attributes: dict[str, Any]
     start_time: float
@@ -109,15 +128,15 @@ class PostProcessing:
     """Quantities that are computed from the draws.
 
     Attributes:
-        scores: of the observations; None where they are not computed.
-        trajectories: see `draw_paths`.
+        scores: of the observations by site, without the sites whose scores are not computed.
+        trajectories: by site, see `draw_paths`.
         attributes: of the result.
         warnings: on the likelihood.
         partial: the groups that a result has after Ctrl-C; None: all.
     """
 
-    scores: Any = None
-    trajectories: TrajectoryDraws = TrajectoryDraws()
+    scores: dict[str, Any] = field(default_factory=dict)
+    trajectories: dict[str, TrajectoryDraws] = field(default_factory=dict)
     attributes: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     partial: str | None = None
@@ -131,26 +150,38 @@ def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint |
         return processed
     if store is not None:  # the draws are safe, whatever happens below
         write_result(store, build_result(problem, draws, processed, store, ONLY_DRAWS))
-    bound, options = problem.bound, problem.options
-    values = {site: draws.values[site].reshape(-1, *draws.values[site].shape[2:]) for site in bound.sites}
+    options = problem.options
+    values = {site: draws.values[site].reshape(-1, *draws.values[site].shape[2:]) for site in problem.bound.sites}
 
     def batch_options(name: str) -> dict[str, Any]:
         return {"report": Console() if show_progress else None, "store": None if store is None else store.batches(name)}
 
+    def label(text: str, name: str) -> str:
+        return f"{text} of site {name}" if problem.bound.is_by_site else text
+
+    def warn(name: str, messages: list[str]) -> None:
+        processed.warnings += [f"site {name}: {text}" if problem.bound.is_by_site else text for text in messages]
+
     try:
-        processed.scores = best_effort(
-            "scores of the observations", lambda: scores(bound, values, **batch_options("scores")), None)
-        processed.attributes = _site_attributes(bound, draws, values, options)
-        processed.warnings += best_effort("resolution of the forces", lambda: resolution_warnings(bound, values), [])
-        if options.sampler in GAUSSIAN_FILTER_SAMPLERS:
-            processed.warnings += best_effort("error of the likelihood", lambda: approximation_warnings(
-                bound, values, _log_likelihood(bound, processed.scores)), [])
-        processed.trajectories = best_effort("trajectories", lambda: draw_paths(
-            options.trajectory_key, bound, draws.values, options.requested_times, options.trajectory_draws,
-            **draws.particle_options, **batch_options("trajectories")), processed.trajectories)
+        for name, site in problem.sites.items():
+            processed.scores[name] = best_effort(label("scores of the observations", name), partial(
+                scores, site.bound, values, **batch_options(label("scores", name))), None)
+        processed.attributes = _site_attributes(problem, draws, values)
+        for name, site in problem.sites.items():
+            warn(name, best_effort(label("resolution of the forces", name),
+                                   partial(resolution_warnings, site.bound, values), []))
+            if options.sampler in GAUSSIAN_FILTER_SAMPLERS:
+                log_likelihood = _log_likelihood(site.bound, processed.scores[name])
+                warn(name, best_effort(label("error of the likelihood", name), partial(
+                    approximation_warnings, site.bound, values, log_likelihood), []))
+        for index, (name, site) in enumerate(problem.sites.items()):
+            key = jax.random.fold_in(options.trajectory_key, index) if index else options.trajectory_key
+            processed.trajectories[name] = best_effort(label("trajectories", name), partial(
+                draw_paths, key, site.bound, draws.values, site.requested_times, options.trajectory_draws,
+                **draws.particle_options, **batch_options(label("trajectories", name))), TrajectoryDraws())
     except KeyboardInterrupt:
-        processed.partial = (ONLY_DRAWS if processed.scores is None
-                             else "all draws and their scores, without trajectories")
+        has_scores = all(processed.scores.get(name) is not None for name in problem.sites)
+        processed.partial = "all draws and their scores, without trajectories" if has_scores else ONLY_DRAWS
     return processed
 
 
@@ -162,17 +193,26 @@ def _log_likelihood(bound: BoundModel, scores: Any) -> np.ndarray | None:
     return terms.reshape(len(terms), -1).sum(axis=1)
 
 
-def _site_attributes(bound: BoundModel, draws: PosteriorDraws, values: Mapping[str, Any],
-                     options: FitOptions) -> dict[str, str]:
-    """Return attributes on the convergence of the sites and on the weights of constrained trajectories."""
-    reports, z = {}, draws.z
-    if options.sampler in GAUSSIAN_FILTER_SAMPLERS and z is not None:
-        reports[arviz_data.SITES] = best_effort(
-            "convergence of the sites", lambda: site_failures(bound, z, options.seed), None)
-    elif options.sampler == "map" and bound.site.example.constraints_in_words:
-        reports[arviz_data.SITES] = best_effort("convergence of the sites", lambda: failures_at(bound, values), None)
-    reports[arviz_data.WEIGHTS] = best_effort(
-        "weights under the constraints", lambda: path_ess(bound, values), None)
+def _site_attributes(problem: FitProblem, draws: PosteriorDraws, values: Mapping[str, Any]) -> dict[str, str]:
+    """Return attributes on the convergence of the sites and on the weights of constrained trajectories.
+
+    Of several likelihood sites the one with the most failures, or the least weights, is reported.
+    """
+    options, z = problem.options, draws.z
+    failures, weights = [], []
+    for bound in (site.bound for site in problem.sites.values()):
+        count_failures = None
+        if options.sampler in GAUSSIAN_FILTER_SAMPLERS and z is not None:
+            count_failures = partial(site_failures, bound, z, options.seed)
+        elif options.sampler == "map" and bound.site.example.constraints_in_words:
+            count_failures = partial(failures_at, bound, values)
+        if count_failures is not None:
+            failures.append(best_effort("convergence of the sites", count_failures, None))
+        weights.append(best_effort("weights under the constraints", partial(path_ess, bound, values), None))
+    reports: dict[str, Any] = {
+        arviz_data.SITES: max(filter(None, failures), key=lambda report: report.unconverged + report.impossible,
+                              default=None),
+        arviz_data.WEIGHTS: min(filter(None, weights), key=lambda report: report.least, default=None)}
     return {name: json.dumps(astuple(report)) for name, report in reports.items() if report is not None}
 
 
@@ -264,10 +304,35 @@ def build_result(problem: FitProblem, draws: PosteriorDraws, processed: PostProc
         "created_at": datetime.now(UTC).isoformat(timespec="seconds"), **draws.attributes, **processed.attributes,
         "partial": partial, "run": None if store is None else store.record, **problem.user_attributes,
     }  # fmt: skip
-    groups = lay_out(problem.bound, draws.values, draws.statistics, processed.scores, processed.trajectories,
-                     problem.truth, problem.labels)
-    attributes |= remember(groups, problem.data, *problem.clock)
+    groups, site_attributes = lay_out_sites(problem.bound, problem.sites, draws.values, draws.statistics, processed)
+    attributes |= site_attributes
     return arviz_data.build(groups, {name: value for name, value in attributes.items() if value is not None})
+
+
+def lay_out_sites(bound: BoundModel, sites: Mapping[str, SiteProblem], values: dict[str, np.ndarray],
+                  statistics: dict[str, np.ndarray],
+                  processed: PostProcessing) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the groups of a result, and its attributes on the sites.
+
+    Args:
+        bound: the model with its data.
+        sites: its likelihood sites by name.
+        values: site -> draws (C, N, ...).
+        statistics: statistic of the sampler -> (C, N).
+        processed: scores and trajectories by site.
+    """
+    groups: dict[str, dict[str, Any]] = {}
+    attributes: dict[str, Any] = {}
+    for name, site in sites.items():
+        groups[name] = lay_out(site.bound, values, statistics, processed.scores.get(name),
+                               processed.trajectories.get(name, TrajectoryDraws()), site.truth, site.labels)
+        attributes |= remember(groups[name], site.data, *site.clock)
+    if bound.is_by_site:
+        settings = {name: {key: value for key, value in site.description.items() if value is not None}
+                    for name, site in sites.items()}
+        return merge_sites(groups), attributes | {arviz_data.LIKELIHOODS: json.dumps(settings)}
+    (single,) = groups.values()
+    return single, attributes
 
 
 def write_result(store: Checkpoint, result: Any) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import xarray as xr
 
 from lfm_ppl.inference.posterior import evenly_spaced, noise_of_rows, trajectories
 from lfm_ppl.io.data_set import InputTable
@@ -14,12 +15,14 @@ from lfm_ppl.model.inputs import Input
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results import inputs as known_inputs
+from lfm_ppl.results.likelihoods import LikelihoodProblem
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
 from lfm_ppl.results.series import series_dimension
+from lfm_ppl.results.sites import select_site
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import Console
 from lfm_ppl.utils.types import Result, Times
-from lfm_ppl.workflows.data_binding import check_requested_times
+from lfm_ppl.workflows.data_binding import check_requested_times, of_site
 
 
 def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: Mapping[str, Any] | None = None,
@@ -46,10 +49,11 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
         result: of `lfm_ppl.fit`, or read by `lfm_ppl.load`.
         numpyro_model: the model that was fitted. A result holds draws and data, but no code.
         times: (K,) times of the forecast, non-decreasing, from the initial time on; dates if the data have dates.
-            (B, K) where the series of a panel have times of their own.
+            (B, K) where the series of a panel have times of their own. With several likelihood sites for all of them,
+            or a dict for some.
         inputs: known inputs (`lfm_ppl.Input`) that reach as far as ``times``, and are the same as before at the data:
             inputs by name, or keyword arguments of the model, that replace the ones of the result. Doses are
-            (times, amounts, "dose:STATE"), with all those before.
+            (times, amounts, "dose:STATE"), with all those before. With several likelihood sites a dict by site.
         model_kwargs: keyword arguments of the model, as in the fit.
         draws: number of posterior draws, spread over the chains, each with a path of its own.
         seed: of the paths and the noise.
@@ -60,7 +64,8 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
         output: new observations under the name of the likelihood's site (``y``), with noise; ``y_mean`` and ``y_sd``,
         their normal distribution at each draw; and ``outputs``, which are noise-free, ``forces``, ``states`` and
         ``deterministics`` along the same paths. `lfm_ppl.score` compares them with data, `lfm_ppl.plot_fit` and
-        `lfm_ppl.plot_forces` draw them. Known ``inputs`` are a group ``predictions_constant_data``.
+        `lfm_ppl.plot_forces` draw them. Known ``inputs`` are a group ``predictions_constant_data``. With several
+        likelihood sites the groups have the names of the sites, see `lfm_ppl.select_site`.
 
     Raises:
         ValueError: times that go back or lie before the initial time; another model than that of the result, seen by
@@ -89,20 +94,39 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
     (2019), Applied Stochastic Differential Equations, chapter 9, for Gaussian moments and what they miss.
     """
     checks.positive_integer("draws", draws)
-    clock = known_inputs.clock_of(result)
-    times = calendar_time.positions("times", times, *clock)
+    sites = list(arviz_data.sites_of(result))
+    requested = {name: of_site("times", times, name, sites) for name in sites} if sites else {"": times}
+    views = {name: select_site(result, name) if sites else result for name in requested}
+    clocks = {name: known_inputs.clock_of(view) for name, view in views.items()}
+    requested = {name: _checked(calendar_time.positions("times", values, *clocks[name]))
+                 for name, values in requested.items() if values is not None}
+    keywords = rebuilding.keywords(result, inputs, model_kwargs)
+    with calendar_time.in_messages(*next(iter(clocks.values()))):
+        problem = rebuilding.problem(result, numpyro_model, model_kwargs=keywords)
+    groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)}
+    for index, name in enumerate(requested):
+        key = jax.random.fold_in(jax.random.key(seed), index) if index else jax.random.key(seed)
+        suffix = f"_{name.replace('/', '.')}" if sites else ""
+        with calendar_time.in_messages(*clocks[name]):
+            new = _forecast(key, views[name], problem.sites[name] if sites else problem, requested[name],
+                            (inputs or {}).get(name, {}) if sites else inputs, draws, progress)
+        # Held-out data of an earlier forecast do not belong to this one.
+        for group in (HELD_OUT, known_inputs.FORECAST):
+            groups.pop(f"{group}{suffix}", None)
+        groups |= {f"{group}{suffix}": dataset for group, dataset in new.items()}
+    return arviz_data.build(groups, arviz_data.attributes(result))
+
+
+def _checked(times: Any) -> np.ndarray:
+    """Return times (K,), or (B, K), after checking their order."""
     if np.ndim(times) == 2:
-        times = np.array([checks.time_vector("times", row, order="non-decreasing") for row in times])
-    else:
-        times = checks.time_vector("times", times, order="non-decreasing")
-    with calendar_time.in_messages(*clock):
-        return _forecast(result, numpyro_model, times, inputs, model_kwargs, draws, seed, progress)
+        return np.array([checks.time_vector("times", row, order="non-decreasing") for row in times])
+    return checks.time_vector("times", times, order="non-decreasing")
 
 
-def _forecast(result: Any, numpyro_model: Callable, times: np.ndarray, inputs: Mapping[str, Any] | None,
-              model_kwargs: Mapping[str, Any] | None, draws: int, seed: int, progress: bool) -> Any:
-    problem = rebuilding.problem(result, numpyro_model,
-                                 model_kwargs=rebuilding.keywords(result, inputs, model_kwargs))
+def _forecast(key: jax.Array, result: Any, problem: LikelihoodProblem, times: np.ndarray,
+              inputs: Mapping[str, Any] | None, draws: int, progress: bool) -> dict[str, xr.Dataset]:
+    """Return the groups of a forecast of one site."""
     bound = problem.bound
     check_possible(bound, times)
     posterior = arviz_data.group(result, "posterior")
@@ -112,7 +136,7 @@ def _forecast(result: Any, numpyro_model: Callable, times: np.ndarray, inputs: M
     settings = None
     if str(attrs.get("sampler", "")).startswith("pmmh") and "particles" in attrs:
         settings = ParticleSettings(int(attrs["particles"]))
-    paths = trajectories(jax.random.key(seed), bound, problem.select(rows).draws, times, settings,
+    paths = trajectories(key, bound, problem.select(rows).draws, times, settings,
                          report=Console() if progress else None)
     split = {name: value.reshape(chains, len(draw_index), *value.shape[1:]) for name, value in paths.items()}
     log_likelihood = split.pop("log_likelihood", None)
@@ -120,19 +144,16 @@ def _forecast(result: Any, numpyro_model: Callable, times: np.ndarray, inputs: M
     if log_likelihood is not None and not bound.site.example.is_family:
         total = log_likelihood.reshape(chains, len(draw_index), -1).sum(axis=-1)
         rebuilding.check_likelihood(result, total, draw_index)
-    # Held-out data of an earlier forecast do not belong to this one.
-    groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result) if name not in (
-        HELD_OUT, known_inputs.FORECAST)}
     labels = posterior["draw"].values[draw_index] if "draw" in posterior.coords else draw_index
-    observed = groups["observed_data"]
+    observed = arviz_data.group(result, "observed_data")
     series = series_dimension(result)
     names = {str(name): observed[name].values.tolist() for name in ("output", series) if name in observed.coords}
-    groups[GROUP] = predictions(bound, split, labels, times, names, series)
+    groups = {GROUP: predictions(bound, split, labels, times, names, series)}
     if continued := {name: InputTable(*value) if isinstance(value, tuple) else InputTable(
             np.asarray(value.times), np.asarray(value.values), value.interpolation)
                      for name, value in (inputs or {}).items() if isinstance(value, Input | tuple)}:
         groups[known_inputs.FORECAST] = known_inputs.to_dataset(continued)
-    return arviz_data.build(groups, attrs)
+    return groups
 
 
 def check_possible(bound: Any, times: np.ndarray) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import jax
@@ -20,12 +21,20 @@ from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.posterior import scores
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.layout import Labels, TrajectoryDraws, checked_truth, lay_out
+from lfm_ppl.results.layout import Labels, TrajectoryDraws, checked_truth
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.types import Result
-from lfm_ppl.workflows.data_binding import check_requested_times
-from lfm_ppl.workflows.fit_options import model_docstring, versions
-from lfm_ppl.workflows.fit_results import best_effort, draw_paths, note_warnings, warn_of_convergence
+from lfm_ppl.workflows.data_binding import check_requested_times, coords_of_site, of_site
+from lfm_ppl.workflows.fit_options import likelihood_settings, model_docstring, versions
+from lfm_ppl.workflows.fit_results import (
+    PostProcessing,
+    SiteProblem,
+    best_effort,
+    draw_paths,
+    lay_out_sites,
+    note_warnings,
+    warn_of_convergence,
+)
 
 _STATISTICS = {"diverging": "diverging", "accept_prob": "acceptance_rate", "num_steps": "n_steps", "energy": "energy",
                "adapt_state.step_size": "step_size", "potential_energy": "lp"}
@@ -46,8 +55,8 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: ArrayLike, y: ArrayLike,
         mcmc: a ``numpyro.infer.MCMC`` that has run, with any kernel; or site name -> draws (chains, draws, ...).
         numpyro_model: its model, ``model(times, y=None, **model_kwargs)``; with the handlers that it was run with, such
             as `lfm_ppl.fix`.
-        times: (T,), as it was run with.
-        y: (T, D), as it was run with.
+        times: (T,), as it was run with; of several likelihood sites a dict by name of the site.
+        y: (T, D), as it was run with, or a dict.
         at: times of the trajectories and of new observations, as in `lfm_ppl.fit`.
         trajectory_draws: number of draws for which trajectories are drawn; 0: none.
         seed: of the trajectories.
@@ -94,24 +103,29 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: ArrayLike, y: ArrayLike,
     draws, stats = _collected(mcmc)
     values = np.asarray(y.to_numpy(), float) if hasattr(y, "to_numpy") else y  # a data frame
     bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
-    check_requested_times(bound, at)
     draws = _checked(bound, draws)
-    labels = Labels.of(bound, dims, coords, y)
-    truth = checked_truth(bound, truth, labels)
     chains, samples = next(iter(draws.values())).shape[:2]
     flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
-    score_values = best_effort("scores of the observations", lambda: scores(bound, flat), None)
-    paths = best_effort("trajectories", lambda: draw_paths(
-        jax.random.key(seed), bound, draws, at, trajectory_draws), TrajectoryDraws())
-    groups = lay_out(bound, draws, stats, score_values, paths, truth, labels)
-    example = bound.site.example
+    sites, processed = {}, PostProcessing()
+    for index, (site, model) in enumerate(bound.site_models.items()):
+        names = list(bound.site_models) if bound.is_by_site else []
+        site_at, site_truth = of_site("at", at, site, names), of_site("truth", truth, site, names)
+        check_requested_times(model, site_at)
+        labels = Labels.of(model, dims, coords_of_site(coords, site, names), None if names else y)
+        sites[site] = SiteProblem(model, labels, site_at, truth=checked_truth(model, site_truth, labels),
+                                  description=likelihood_settings(model.site.example))
+        processed.scores[site] = best_effort("scores of the observations", partial(scores, model, flat), None)
+        key = jax.random.fold_in(jax.random.key(seed), index) if index else jax.random.key(seed)
+        processed.trajectories[site] = best_effort("trajectories", partial(
+            draw_paths, key, model, draws, site_at, trajectory_draws), TrajectoryDraws())
+    groups, site_attributes = lay_out_sites(bound, sites, draws, stats, processed)
     kernel = getattr(mcmc, "sampler", None)
     attrs = {
         "model": name or getattr(numpyro_model, "__name__", "model"), "description": model_docstring(numpyro_model),
-        **example.recorded_settings, "sampler": "draws" if kernel is None else type(kernel).__name__.lower(),
+        **({} if bound.is_by_site else likelihood_settings(bound.site.example)), "likelihood": None, **site_attributes,
+        "sampler": "draws" if kernel is None else type(kernel).__name__.lower(),
         "chains": chains, "samples": samples, "fixed": "{}", "versions": json.dumps(versions()),
         "created_at": datetime.now(UTC).isoformat(timespec="seconds"),
-        "constraints": example.constraints_in_words or None,
     }
     if kernel is not None:
         attrs |= {"warmup": int(mcmc.num_warmup), "thin": int(mcmc.thinning)}

@@ -41,9 +41,13 @@ class LikelihoodHandler(Handler):
 
     Args:
         fn: a NumPyro model; None where the handler is used as a context.
+
+    Attributes:
+        only_site: name of the site whose likelihood is replaced; None: of all sites.
     """
 
     supports_constraints = True
+    only_site: str | None = None
 
     def __init__(self, fn: Callable[..., Any] | None = None) -> None:
         self.has_site = False
@@ -69,7 +73,8 @@ class LikelihoodHandler(Handler):
     def process_message(self, msg: dict[str, Any]) -> None:
         """Replace the distribution of the site."""
         fn = msg.get("fn")
-        if msg["type"] == "sample" and isinstance(fn, (SeriesLikelihood, Panel)):
+        is_selected = self.only_site is None or self.only_site == msg.get("name")
+        if msg["type"] == "sample" and is_selected and isinstance(fn, (SeriesLikelihood, Panel)):
             series = fn.first if isinstance(fn, Panel) else fn
             if isinstance(series, ConstrainedLikelihood) and not self.supports_constraints:
                 return

@@ -11,7 +11,7 @@ from typing import Any
 from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 
-from lfm_ppl.results.arviz_data import group, has_group, of_mode
+from lfm_ppl.results.arviz_data import group, has_group, of_mode, refuse_several_sites
 from lfm_ppl.results.inputs import inputs_of
 from lfm_ppl.results.plots import accuracy, chains, forecasts, inputs, pairs, residuals, trajectories
 from lfm_ppl.results.scalars import sampled
@@ -87,6 +87,7 @@ def save_figures(
 
 def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[str] | None]]:
     """Yield file name, function and the names to draw, for each page of each figure."""
+    refuse_several_sites(result)
     later = forecasts.is_made_later(result)
     series = [] if series_dimension(result) is None else series_labels(result)
     for prefix in ("", "forecast-") if later else ("",):

@@ -17,7 +17,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfm_ppl.results.arviz_data import group, has_group
+from lfm_ppl.results.arviz_data import group, has_group, refuse_several_sites
 from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import forecasts, style
 from lfm_ppl.results.predictions import INTERVAL, PERIODS, SHOWN_PERIODS, quantiles, repeats_often
@@ -73,6 +73,7 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any =
         >>> figure.axes[0].get_ylabel()
         'mRNA (nM)'
     """
+    refuse_several_sites(result)
     observed = group(result, "observed_data")["y"]
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
     parts, remark = recent_series(result, series, len(names))

@@ -1,0 +1,97 @@
+"""Results of models with several likelihood sites: their layout, and the view of one site as a result of one site.
+
+1. Parameters, statistics of the sampler and the accuracy check are common to all sites.
+2. Groups of observations hold one variable for each site, with dimensions of its own: ``y`` over ``y_time``.
+3. Every other group belongs to one site and has its name: ``trajectories_y``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import xarray as xr
+
+from lfm_ppl.results import arviz_data
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.types import Result
+
+_COMMON = ("posterior", "sample_stats", "log_prior", "accuracy")
+"""Groups that do not depend on the site."""
+
+_OBSERVED = ("observed_data", "log_likelihood", "posterior_predictive")
+"""Groups with one variable for each site."""
+
+_OF_SITE = ("one_step_ahead", "trajectories", "predictions", "truth", "constant_data", "predictions_constant_data",
+            "held_out_data")
+"""Groups that each site has for itself."""
+
+_VARIABLE = "y"
+"""Name of the observations in the view of a site."""
+
+
+def merge_sites(sites: Mapping[str, Mapping[str, xr.Dataset]]) -> dict[str, xr.Dataset]:
+    """Return the groups of a result with several sites, from the groups of each site by name."""
+    merged: dict[str, xr.Dataset] = {}
+    for name, groups in sites.items():
+        stored = name.replace("/", ".")
+        for group, dataset in groups.items():
+            if group in _COMMON:
+                merged.setdefault(group, dataset)
+            elif group in _OBSERVED:
+                labels = (*dataset.dims, *({"times"} & set(dataset.variables)))
+                names = {label: f"{stored}_{label}" for label in labels if label not in ("chain", "draw")}
+                names[name] = stored
+                merged[group] = merged.get(group, xr.Dataset()).merge(dataset.rename(names))
+            else:
+                merged[f"{group}_{stored}"] = dataset
+    return merged
+
+
+def select_site(result: Result, name: str) -> Result:
+    """Return the part of a result that belongs to one likelihood site, as a result of a model with that site alone.
+
+    Figures, tables, scores and reports of one site take it. Its observations are called ``y``, whatever the name of the
+    site.
+
+    Args:
+        result: what `lfm_ppl.fit` or `lfm_ppl.forecast` returned for a model with several likelihood sites.
+        name: name of the site.
+
+    Returns:
+        An ArviZ object with the groups of `lfm_ppl.fit`; it shares the arrays of ``result``.
+
+    Raises:
+        ValueError: the result has no such site.
+
+    Example:
+        >>> import numpy as np, lfm_ppl as lfm
+        >>> groups = {name: {"observed_data": xr.Dataset({name: (("time", "output"), np.zeros((count, 1)))})}
+        ...           for name, count in (("short", 2), ("long", 5))}
+        >>> merged = merge_sites(groups)["observed_data"]
+        >>> merged["long"].dims
+        ('long_time', 'long_output')
+        >>> result = arviz_data.build({"observed_data": merged}, {"likelihood_sites": '{"short": {}, "long": {}}'})
+        >>> lfm.select_site(result, "long")["observed_data"]["y"].dims
+        ('time', 'output')
+    """
+    settings = arviz_data.sites_of(result)
+    if name not in settings:
+        raise ValueError(checks.unknown("likelihood site", name, settings) if settings else
+                         f"the result has one likelihood site, so that {name!r} cannot be selected; take the result "
+                         "itself.")
+    stored = name.replace("/", ".")
+    groups = {}
+    for group in arviz_data.groups(result):
+        dataset, kind = arviz_data.group(result, group), group.removesuffix(f"_{stored}")
+        if group in _COMMON:
+            groups[group] = dataset
+        elif group in _OBSERVED and stored in dataset:
+            part = dataset[[variable for variable in (stored, f"{stored}_times") if variable in dataset]]
+            names = {label: str(label).removeprefix(f"{stored}_") for label in (*part.variables, *part.dims)}
+            groups[group] = part.rename(names | {stored: _VARIABLE})
+        elif group != kind and kind in _OF_SITE:
+            groups[kind] = dataset.rename({stored: _VARIABLE}) if stored in dataset else dataset
+            if "observed" in dataset.attrs:
+                groups[kind] = groups[kind].assign_attrs(observed=_VARIABLE)
+    attributes = {key: value for key, value in arviz_data.attributes(result).items() if key != arviz_data.LIKELIHOODS}
+    return arviz_data.build(groups, attributes | settings[name])

@@ -1,0 +1,184 @@
+"""Fits of models with several likelihood sites: posterior, groups by site, forecasts, files."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pandas as pd
+import pytest
+
+import lfm_ppl as lfm
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.plots import save_figures
+
+TIMES = {"a": np.arange(6.0), "b": np.arange(0.0, 4.0, 0.5)}
+Y = {"a": np.exp(-0.4 * TIMES["a"])[:, None],
+     "b": np.exp(-0.4 * TIMES["b"])[:, None] * np.array([2.0, 6.0])}
+GAIN = {"a": np.array([1.0]), "b": np.array([1.0, 3.0])}
+
+
+def likelihood(name, rate, times, heat=None):
+    gain = jnp.asarray(GAIN[name])
+    system = lfm.LatentForceModel(
+        lambda x, u, t: u - rate * x + (0.0 if heat is None else heat(t)), {"f": lfm.Matern(0.1, 2.0)},
+        lfm.GaussianObservation(lambda x, u, t: gain * x[0], 0.01 * jnp.ones(len(gain))),
+        lfm.Gaussian(jnp.array([float(Y[name][0, 0])]), 0.01 * jnp.eye(1)))
+    return lfm.MarginalLikelihood(system, times)
+
+
+def both(times, y):
+    rate = numpyro.sample("rate", dist.LogNormal(-1.0, 0.5))
+    for name in ("a", "b"):
+        numpyro.sample(name, likelihood(name, rate, times[name]), obs=y[name])
+
+
+DATA = {"a": lfm.Data(TIMES["a"], Y["a"], ("level",), units={"time": "h"}), "b": (TIMES["b"], Y["b"])}
+
+
+SETTINGS = {"sampler": "map", "samples": 40, "trajectory_draws": 20, "at": {"b": [1.0, 5.0]}, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("run")
+
+
+@pytest.fixture(scope="module")
+def fitted(folder):
+    return lfm.fit(both, DATA, checkpoint=folder, overwrite=True, **SETTINGS)
+
+
+def posterior_mean():
+    """Return mean and sd of the rate by quadrature over the product of the two likelihoods."""
+    grid = np.linspace(0.2, 0.7, 400)
+    density = jax.jit(jax.vmap(lambda rate: dist.LogNormal(-1.0, 0.5).log_prob(rate) + sum(
+        likelihood(name, rate, TIMES[name]).log_prob(Y[name]) for name in Y)))(grid)
+    weight = np.exp(density - density.max())
+    weight /= weight.sum()
+    mean = weight @ grid
+    return mean, np.sqrt(weight @ (grid - mean) ** 2)
+
+
+@pytest.mark.parametrize("sampler", ["ram", "nuts"])
+def test_samplers_have_the_posterior_of_the_product(sampler):
+    result = lfm.fit(both, DATA, sampler=sampler, chains=2, warmup=150, samples=500, trajectory_draws=0,
+                     chain_method="vectorized", progress=False)
+    mean, sd = posterior_mean()
+    table = arviz_data.summary(result)
+    assert abs(table.loc["rate", "mean"] - mean) < 4 * table.loc["rate", "mcse_mean"]
+    assert table.loc["rate", "sd"] == pytest.approx(sd, rel=0.2)
+
+
+def test_a_sampler_of_one_site_says_so():
+    with pytest.raises(ValueError, match=r"'pmmh'.*a, b"):
+        lfm.fit(both, DATA, sampler="pmmh", progress=False)
+
+
+def test_groups_by_site(fitted):
+    observed = arviz_data.group(fitted, "observed_data")
+    assert observed["a"].dims == ("a_time", "a_output") and observed["b"].dims == ("b_time", "b_output")
+    assert observed["a_output"].values.tolist() == ["level"]
+    for name in Y:
+        np.testing.assert_array_equal(observed[name], Y[name])
+        assert arviz_data.group(fitted, "log_likelihood")[name].shape == (1, 40, len(TIMES[name]))
+        assert arviz_data.group(fitted, "posterior_predictive")[name].shape == (1, 20, *Y[name].shape)
+        terms = arviz_data.group(fitted, f"one_step_ahead_{name}")["log_density"]
+        rates = arviz_data.group(fitted, "posterior")["rate"].values.ravel()
+        expected = [likelihood(name, rate, TIMES[name]).log_prob(Y[name]) for rate in rates[:3]]
+        np.testing.assert_allclose(terms.sum("time").values.ravel()[:3], expected, atol=1e-10)
+    assert "predictions_b" in arviz_data.groups(fitted) and "predictions_a" not in arviz_data.groups(fitted)
+    with pytest.raises(ValueError, match="select_site"):
+        arviz_data.group(fitted, "trajectories")
+
+
+def test_a_selected_site_is_a_result_of_one_site(fitted, tmp_path):
+    lfm.save(fitted, tmp_path / "fit.nc")
+    for result in (fitted, lfm.load(tmp_path / "fit.nc")):
+        site = lfm.select_site(result, "b")
+        assert set(arviz_data.groups(site)) == {"posterior", "log_prior", "observed_data", "log_likelihood",
+                                                "one_step_ahead", "trajectories", "posterior_predictive",
+                                                "predictions"}
+        assert arviz_data.group(site, "observed_data")["y"].dims == ("time", "output")
+        assert arviz_data.group(site, "predictions")["y"].sizes["time"] == 2
+        assert arviz_data.attributes(site)["likelihood"].startswith("exact")
+        assert lfm.plot_fit(site) is not None
+    with pytest.raises(ValueError, match="'c'"):
+        lfm.select_site(fitted, "c")
+
+
+def test_forecast_and_score_by_site(fitted):
+    ahead = lfm.forecast(fitted, both, {"a": [6.0, 7.0]}, progress=False)
+    assert arviz_data.group(ahead, "predictions_a")["a"].shape == (1, 40, 2, 1)
+    expected = np.exp(-0.4 * np.array([[6.0], [7.0]]))
+    table = lfm.score(lfm.select_site(ahead, "a"), expected)
+    assert table.index.tolist() == ["level", "all"] and table.loc["all", "rmse"] < 0.3
+    with pytest.raises(ValueError, match="'c'"):
+        lfm.forecast(fitted, both, {"c": [6.0]}, progress=False)
+
+
+def test_the_check_adds_the_sites(fitted):
+    report = lfm.check_accuracy(fitted, both, draws=10, particles=500, replicates=2, reference="particles",
+                                progress=False)
+    rates = arviz_data.group(fitted, "posterior")["rate"].sel(draw=report.dataset["draw"]).values.ravel()
+    expected = [sum(likelihood(name, rate, TIMES[name]).log_prob(Y[name]) for name in Y) for rate in rates]
+    np.testing.assert_allclose(report.dataset["log_likelihood"].values.ravel(), expected, atol=1e-10)
+    noise = report.dataset["noise_sd"].values.ravel()
+    assert np.all(np.abs(report.dataset["log_likelihood_reference"].values.ravel() - expected) < 6 * noise + 0.1)
+
+
+def test_report_and_figures_of_a_site(fitted, tmp_path):
+    site = lfm.select_site(fitted, "b")
+    names = {path.name for path in save_figures(site, tmp_path)}
+    assert {"fit.png", "forces.png", "residuals.png", "pairs.png"} <= names
+    assert "y1" in lfm.save_report(site, tmp_path, figures=()).read_text()
+    for draw in (lfm.plot_fit, lfm.plot_forces, lfm.plot_residuals, lambda result: save_figures(result, tmp_path),
+                 lambda result: lfm.save_report(result, tmp_path / "page.html")):
+        with pytest.raises(ValueError, match=r"sites a, b.*select_site\(result, 'a'\)"):
+            draw(fitted)
+
+
+def test_dates_of_all_sites_count_from_one_midnight():
+    days = {name: pd.date_range(first, periods=len(Y[name]), freq="D")
+            for name, first in (("a", "2026-01-02"), ("b", "2026-01-01"))}
+    result = lfm.fit(both, {name: (days[name], Y[name]) for name in Y}, sampler="map", samples=2, trajectory_draws=0,
+                     progress=False)
+    observed = arviz_data.group(result, "observed_data")
+    assert observed["a_time"].values[0] == 1.0 and observed["b_time"].values[0] == 0.0
+    assert arviz_data.attributes(result)["time_origin"].startswith("2026-01-01")
+
+
+def heated(times, y, inputs):
+    rate = numpyro.sample("rate", dist.LogNormal(-1.0, 0.5))
+    for name in ("a", "b"):
+        numpyro.sample(name, likelihood(name, rate, times[name], inputs[name].get("heat")), obs=y[name])
+
+
+def test_known_inputs_reach_their_site():
+    heat = (np.array([0.0, 2.0]), np.array([0.5, 0.0]))
+    data = {"a": lfm.Data(TIMES["a"], Y["a"], ("level",), inputs={"heat": heat}), "b": DATA["b"]}
+    result = lfm.fit(heated, data, sampler="map", samples=2, trajectory_draws=0, progress=False)
+    rate = float(arviz_data.group(result, "posterior")["rate"][0, 0])
+    for name, known in (("a", lfm.Input(*heat)), ("b", None)):
+        terms = arviz_data.group(result, f"one_step_ahead_{name}")["log_density"][0, 0]
+        assert float(terms.sum()) == pytest.approx(
+            float(likelihood(name, rate, TIMES[name], known).log_prob(Y[name])), abs=1e-9)
+    longer = lfm.Input(np.array([0.0, 2.0, 7.0]), np.array([0.5, 0.0, 1.0]))
+    ahead = lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"a": {"heat": longer}}, progress=False)
+    assert {"predictions_a", "predictions_constant_data_a"} <= set(arviz_data.groups(ahead))
+
+
+def test_a_finished_fit_is_read_again(fitted, folder):
+    again = lfm.fit(both, DATA, checkpoint=folder, resume=True, **SETTINGS)
+    np.testing.assert_array_equal(arviz_data.group(again, "posterior")["rate"],
+                                  arviz_data.group(fitted, "posterior")["rate"])
+    other = {**DATA, "b": (TIMES["b"], 2 * Y["b"])}
+    with pytest.raises(ValueError, match="data"):
+        lfm.fit(both, other, checkpoint=folder, resume=True, **SETTINGS)
+
+
+def test_draws_of_numpyro(fitted):
+    draws = {"rate": arviz_data.group(fitted, "posterior")["rate"].values}
+    result = lfm.to_arviz(draws, both, TIMES, Y, trajectory_draws=0)
+    np.testing.assert_allclose(arviz_data.group(result, "log_likelihood")["b"],
+                               arviz_data.group(fitted, "log_likelihood")["b"], atol=1e-10)
