@@ -192,7 +192,7 @@ class SeriesLikelihood(dist.Distribution):
         Args:
             y: (T, D), NaN where missing.
             at: (K,) requested times, or the result of `lay_out` for them; None: the times of the data.
-            steps: integration steps between two consecutive times; None: those of the distribution.
+            steps: integration steps between two consecutive times; None: `steps` of the distribution.
         """
         if at is None and steps is None:
             grid = self.time_grid

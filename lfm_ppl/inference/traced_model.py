@@ -275,7 +275,7 @@ class TracedModel:
         return ravel_pytree(_unconstrained(trace))[0], trace
 
     def with_times(self, y: Any) -> Callable:
-        """Return the seeded model with the times of its likelihoods: constants, or those of `ModelArguments`."""
+        """Return the seeded model with constant times of its likelihoods, or with the times in `ModelArguments`."""
         if isinstance(y, ModelArguments):
             return replace_times(self._seeded, y.inputs.value[1])
         times = {name: SiteTimes(site_times.times) for name, site_times in self.site_times.items()}
