@@ -67,8 +67,8 @@ def bounds(flag: str, texts: Sequence[str]) -> dict[str, float] | None:
 def inputs(columns: Columns, model: ModelFile) -> dict[str, tuple[str, str]]:
     """Return the known inputs to read: name -> column of the file, interpolation.
 
-    Columns of ``--inputs A,B:linear,C:zero`` are in the order of the model's inputs, those of ``--events A:STATE`` are
-    doses. By default the columns have the names of the model's inputs.
+    Columns of ``--inputs A,B:linear,C:zero`` are in the order of the model's inputs. Columns of ``--events A:STATE``
+    are doses. By default the columns have the names of the model's inputs.
     """
     functions = {name: way for name, way in model.inputs.items() if not way.startswith(DOSE)}
     doses = {name: way for name, way in model.inputs.items() if way.startswith(DOSE)}

@@ -190,11 +190,11 @@ def apply_event(prediction: Prediction, state_map: StateMap, has_map: bool) -> P
     keep, mean = state_map.keep, state_map.apply(mean)
     if keep is None:
         return prediction._replace(moments=Moments(mean, covariance))
-    both = keep[:, None] * keep
-    prediction = prediction._replace(moments=Moments(mean, both * covariance))
+    keep_pairs = keep[:, None] * keep
+    prediction = prediction._replace(moments=Moments(mean, keep_pairs * covariance))
     if not has_map:
         return prediction
-    return prediction._replace(phi=keep[:, None] * prediction.phi, process_cov=both * prediction.process_cov)
+    return prediction._replace(phi=keep[:, None] * prediction.phi, process_cov=keep_pairs * prediction.process_cov)
 
 
 def predict_by_map(moments: Moments, phi: jax.Array, process_cov: jax.Array, point: jax.Array,

@@ -95,7 +95,7 @@ def lay_out_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: fl
         checks.positive("tolerance", tolerance)
     events = event_table(ssm.model.events)
     if initial_time is not None:
-        events = events.after(initial_time)
+        events = events.exclude_past(initial_time)
     initial_time = ssm.model.initial_time if initial_time is None else initial_time
     concrete_times = check_times(times, initial_time)
     start = concrete_times[0] if initial_time is None and concrete_times is not None else initial_time

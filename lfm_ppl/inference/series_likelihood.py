@@ -241,10 +241,10 @@ class SeriesLikelihood(dist.Distribution):
 
 
 def refuse_times_by_site(times: Any) -> None:
-    """Raise TypeError for the times of several sites in the place of those of one."""
+    """Raise TypeError if the times of one site are a dict of the times of several sites."""
     if isinstance(times, Mapping):
         name = next(iter(times), "y")
-        raise TypeError(f"times must be those of one site, got a dict of {', '.join(map(str, times)) or 'none'}: write "
+        raise TypeError(f"times must be an array, the times of one site, got a dict of {', '.join(map(str, times)) or 'none'}: write "
                         f"times[{name!r}], and obs=y[{name!r}].")
 
 

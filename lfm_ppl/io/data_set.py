@@ -169,12 +169,12 @@ def _by_name(tables: Mapping[str, InputTable], make: Callable[[str, InputTable],
     groups: dict[str, list[InputTable]] = {}
     for name, table in tables.items():
         groups.setdefault(name.partition(OF_SERIES)[0], []).append(table)
-    made = {}
+    stacked = {}
     for name, members in groups.items():
         size = max(len(table.times) for table in members)
         entries = [make(name, _padded(table, size)) for table in members]
-        made[name] = entries[0] if name in tables else jax.tree.map(lambda *leaves: np.stack(leaves), *entries)
-    return made
+        stacked[name] = entries[0] if name in tables else jax.tree.map(lambda *leaves: np.stack(leaves), *entries)
+    return stacked
 
 
 def _padded(table: InputTable, size: int) -> InputTable:

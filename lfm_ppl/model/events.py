@@ -179,7 +179,7 @@ class EventTable(NamedTuple):
         """Whether the time of an event is traced (E,)."""
         return np.isinf(self.times)
 
-    def after(self, time: Any) -> EventTable:
+    def exclude_past(self, time: Any) -> EventTable:
         """Return the table in which events that a filter's state at a time includes do not happen any more."""
         start = checks.concrete(time)
         if start is None:
