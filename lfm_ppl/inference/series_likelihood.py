@@ -244,8 +244,8 @@ def refuse_times_by_site(times: Any) -> None:
     """Raise TypeError if the times of one site are a dict of the times of several sites."""
     if isinstance(times, Mapping):
         name = next(iter(times), "y")
-        raise TypeError(f"times must be an array, the times of one site, got a dict of {', '.join(map(str, times)) or 'none'}: write "
-                        f"times[{name!r}], and obs=y[{name!r}].")
+        raise TypeError("times must be an array, the times of one site, got a dict of "
+                        f"{', '.join(map(str, times)) or 'none'}: write times[{name!r}], and obs=y[{name!r}].")
 
 
 def repeat_draw(draw: Callable[[jax.Array], jax.Array], key: jax.Array, sample_shape: tuple[int, ...]) -> jax.Array:
