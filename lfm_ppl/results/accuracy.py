@@ -288,7 +288,10 @@ def _kind(reference: str, ssm: StateSpaceModel) -> str:
     if reference == "grid" and family:
         raise ValueError("reference='grid' takes Gaussian observations, and this model has an observation family. Use "
                          "reference='particles'.")
-    one_state = ssm.state_dim == 1 and not family
+    one_state = ssm.state_dim == 1 and not family and not ssm.model.events
+    if reference == "grid" and ssm.model.events:
+        raise ValueError("reference='grid' takes models without events, and this one has some. Use "
+                         "reference='particles'.")
     if reference == "grid" and not one_state:
         names = (*ssm.model.state_names, *ssm.model.force_names)
         raise ValueError(f"reference='grid' takes models of one state; this one has {ssm.state_dim}, of "

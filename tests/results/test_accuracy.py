@@ -424,3 +424,14 @@ def test_fixed_parameters_stay_fixed():
     result = fitted(model, fixed={"sd": 0.3})
     report = check_accuracy(result, model, reference="particles", particles=50, draws=8, progress=False)
     assert list(report.table.index) == ["depth"]
+
+
+def test_the_grid_is_not_for_models_with_events():
+    model = lfm.LatentForceModel(
+        lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1), events=[lfm.Dose([1.0], 1.0, "x0")])
+    assert accuracy._kind("auto", lfm.state_space(model)) == "particles"
+    with pytest.raises(ValueError, match="events"):
+        accuracy._kind("grid", lfm.state_space(model))
+    with pytest.raises(ValueError, match="events"):
+        lfm.fokker_planck(model, np.arange(3.0), np.ones((3, 1)))
