@@ -12,6 +12,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -102,6 +105,8 @@ def lay_out_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: fl
     origin = None if start is None else checks.concrete(start)
     is_adaptive = tolerance is not None
     reads: list[InputRead] = []
+    if concrete_times is None and _refuses_traced_times.get():
+        raise ValueError("a time grid of traced times differs from that of their values.")
     if concrete_times is None or origin is None:
         division = Division(steps, max_step, interval_per_step, is_adaptive)
         layout = GridLayout(_traced_grid(ssm, times, initial_time, requested_times, division, events))
@@ -114,6 +119,19 @@ def lay_out_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: fl
     if tolerance is not None:
         layout = layout._replace(grid=layout.grid._replace(tolerance=float(tolerance)))
     return layout, reads, events
+
+
+_refuses_traced_times: ContextVar[bool] = ContextVar("_refuses_traced_times", default=False)
+
+
+@contextlib.contextmanager
+def refuse_traced_times() -> Iterator[None]:
+    """Raise ValueError, within the context, for a grid of traced times, whose steps differ from those of values."""
+    token = _refuses_traced_times.set(True)
+    try:
+        yield
+    finally:
+        _refuses_traced_times.reset(token)
 
 
 def _concrete_layout(ssm: StateSpaceModel, times: np.ndarray, origin: float, requested_times: Any,

@@ -34,6 +34,7 @@ from numpyro.infer import init_to_median, init_to_sample
 from numpyro.infer.util import constrain_fn, potential_energy
 from numpyro.infer.util import log_density as constrained_log_density
 
+from lfm_ppl.filtering.time_grid import refuse_traced_times
 from lfm_ppl.inference.likelihood_site import (
     LikelihoodSite,
     SiteTimes,
@@ -206,8 +207,10 @@ class TracedModel:
     def _is_traceable(self, arguments: ModelArguments) -> bool:
         """Return whether the model can be run with traced arguments, and has the same structure then."""
         try:
-            traced = self._recorded(_traced_structure, self._seeded, jax.eval_shape, jnp.zeros(self.size), arguments)
-        except _TRACING_ERRORS:
+            with refuse_traced_times():
+                traced = self._recorded(_traced_structure, self._seeded, jax.eval_shape, jnp.zeros(self.size),
+                                        arguments)
+        except Exception:  # of any kind: a model may do with its arguments what tracers cannot
             return False
         return list(traced.values()) == self._structures
 
