@@ -110,10 +110,10 @@ def insert_traced_times(grid: TimeGrid, breakpoints: Any, events: EventTable, is
     count = np.shape(breakpoints)[0]
     if not count + len(index):
         return grid
-    times = events.times if events.traced_times is None else events.traced_times
-    breakpoints = jnp.concatenate([breakpoints, jnp.asarray(times)[index]])
+    breakpoints = jnp.concatenate([breakpoints, jnp.asarray(events.all_times)[index]])
     intervals, origin = grid.intervals, jnp.asarray(grid.initial_time, float)
-    since_end = jnp.append(jnp.asarray(grid.since)[1:], jnp.asarray(grid.since)[-1] + intervals.length[-1])
+    # The last one exactly as the times of events are counted, so that an event at the last time is not past it.
+    since_end = jnp.append(jnp.asarray(grid.since)[1:], intervals.end[-1] - origin)
     inserted = jnp.clip(breakpoints - origin, 0.0, since_end[-1])
     merged = jnp.concatenate([since_end, inserted])
     rank = np.concatenate([np.full(np.shape(since_end), OBSERVATION), np.full(count, EVENT_AFTER),

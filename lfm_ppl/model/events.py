@@ -24,7 +24,16 @@ from lfm_ppl.utils import checks
 
 
 class Event(eqx.Module):
-    """Jumps of the physical state at the times ``times + lag``; the base of `Dose` and `Reset`."""
+    """Jumps of the physical state at the times ``times + lag``; the base of `Dose` and `Reset`.
+
+    Attributes:
+        times: (K,).
+        values: amounts or values, () or (K,).
+        state: name of the state that jumps; None where a dose has a ``direction`` (M,).
+        lag: () or (K,).
+        observation_first: whether an observation at the time of an event is taken before it.
+        is_reset: whether the state is set to the value, and not moved by it.
+    """
 
     times: Any
     values: Any
@@ -49,10 +58,10 @@ class Event(eqx.Module):
                              f"times, got shape {np.shape(values)}.")
         if np.ndim(lag) > 1 or np.ndim(lag) == 1 and np.shape(lag) != np.shape(times):
             raise ValueError(f"lag of a {label} must be one number or one for each time, got shape {np.shape(lag)}.")
-        self.values, self.lag = values, _concrete(lag)
-        self.state, self.direction = (target, None) if isinstance(target, str) else (None, target)
-        if self.state is None:
+        self.values, self.lag = _concrete(values), _concrete(lag)
+        if not isinstance(target, str):
             checks.finite(f"target of a {label}", target)
+        self.state, self.direction = (target, None) if isinstance(target, str) else (None, _concrete(target))
         self.observation_first, self.is_reset = bool(observation_first), is_reset
 
     @property
@@ -173,6 +182,11 @@ class EventTable(NamedTuple):
     times: np.ndarray
     traced_times: Any
     observation_first: np.ndarray
+
+    @property
+    def all_times(self) -> Any:
+        """Times of all events (E,)."""
+        return self.times if self.traced_times is None else self.traced_times
 
     @property
     def is_traced(self) -> np.ndarray:
