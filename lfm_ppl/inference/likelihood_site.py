@@ -35,6 +35,14 @@ class LikelihoodSite(NamedTuple):
             return self.distribution.first
         return self.distribution
 
+    @property
+    def members(self) -> list[SeriesLikelihood]:
+        """The distributions of all series."""
+        distribution = self.distribution
+        if isinstance(distribution, Panel):
+            return [distribution.series(index) for index in range(distribution.batch_shape[0])]
+        return [distribution]
+
 
 def likelihood_site(model: Callable, arguments: tuple, keywords: Mapping[str, Any], key: jax.Array,
                     parameters: Mapping[str, Any] | None = None, name: str | None = None) -> LikelihoodSite:

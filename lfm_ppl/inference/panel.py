@@ -24,6 +24,7 @@ from lfm_ppl.filtering.intervals import RUNGE_KUTTA
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, refuse_times_by_site, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.events import event_table
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import check_times
@@ -64,11 +65,19 @@ class Panel(dist.Distribution):
             except ValueError as error:
                 raise ValueError(f"series {series}: {error}") from None
         # Times that all series share stay concrete, because jumps of a force and longest steps depend on them.
-        example = jax.eval_shape(
-            lambda p, t: jnp.zeros(self._likelihood(p, t if self._has_series_times else times).event_shape),
-            jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], parameters), jnp.zeros(np.shape(times)[-1]))
+        has_events = []
+
+        def zero_event(p: Any, t: jax.Array) -> jax.Array:
+            likelihood = self._likelihood(p, t if self._has_series_times else times)
+            has_events.append(bool(likelihood.model.events))
+            return jnp.zeros(likelihood.event_shape)
+
+        example = jax.eval_shape(zero_event, jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], parameters),
+                                 jnp.zeros(np.shape(times)[-1]))
         if not self._has_series_times:
             _ = self.first  # eager checks of concrete values
+        if any(has_events) and not checks.traced((parameters, times)):
+            self._check_events(np.shape(leaves[0])[0])
         super().__init__((count,), example.shape, validate_args=False)
 
     @property
@@ -77,6 +86,23 @@ class Panel(dist.Distribution):
 
     def _likelihood(self, parameters: Any, times: Any) -> SeriesLikelihood:
         return MarginalLikelihood(self.build(parameters), times, **self.settings)
+
+    def _check_events(self, count: int) -> None:
+        """Raise ValueError if an event of a series lies before its initial time."""
+
+        def first_event(parameters: Any, times: jax.Array) -> tuple[jax.Array, jax.Array]:
+            model = self.build(parameters)
+            start = times[0] if model.initial_time is None else jnp.asarray(model.initial_time)
+            return jnp.min(jnp.asarray(event_table(model.events).all_times), initial=jnp.inf), start
+
+        parameters = jax.tree_util.tree_map(jnp.asarray, self.parameters)
+        times = jnp.broadcast_to(jnp.asarray(self.times, float), (count, np.shape(self.times)[-1]))
+        first, start = jax.vmap(first_event)(parameters, times)
+        if checks.traced((first, start)) or not (first < start).any():  # build may close over traced parameters
+            return
+        series = int(np.argmax(first < start))
+        raise ValueError(f"series {series}: an event at time {first[series]:g} lies before the initial time "
+                         f"{start[series]:g} of the model; set initial_time to the time of the first event or earlier.")
 
     @property
     def first(self) -> SeriesLikelihood:

@@ -283,9 +283,8 @@ def _plan(bound: BoundModel, requested_times: np.ndarray | None, simulated: bool
     # The first requested time pads the times between requested ones, of which series have different numbers.
     rows = [np.insert(times, count, np.repeat(times[0], length - len(times)))
             for times in (plan.times for plan in plans) if times is not None]
-    example = bound.site.example
-    smoother_steps = [_steps_per_interval(example.ssm, times, row, example.steps)
-                      for times, row in zip(bound.times, rows, strict=True)]
+    smoother_steps = [_steps_per_interval(series.ssm, times, row, series.steps)
+                      for series, times, row in zip(bound.site.members, bound.times, rows, strict=True)]
     return _Plan(np.array(rows), plans[0].requested, np.arange(length - data, length),
                  max(plan.steps for plan in plans), max(smoother_steps))
 
@@ -338,9 +337,10 @@ def _simulate_forecast(distribution: SeriesLikelihood, states: jax.Array, when: 
     """Return the joint states (L, n), simulated after the last smoothed one; ``is_smoothed`` is (L,)."""
     order = jnp.arange(plan.rows) if plan.times is None else jnp.argsort(when, stable=True)
     # Breakpoints before the first time or after the last one change nothing.
-    layout = distribution.layout
-    breakpoints = (input_breakpoints(distribution.model, None, None) if layout is None
-                   else layout.breakpoints(distribution.model.input_reads(0.0, 1.0)))
+    layout, reads = distribution.layout, distribution.model.input_reads(0.0, 1.0)
+    # A read at another function of time than t - lag may be seen in one span of time, and not in another.
+    breakpoints = (input_breakpoints(distribution.model, None, None) if layout is None or len(reads) != len(layout.rows)
+                   else layout.breakpoints(reads))
     path = simulate_missing_states(distribution.ssm, key, states[order], when[order], is_smoothed[order], plan.steps,
                                    breakpoints)
     return jnp.zeros_like(states).at[order].set(path)

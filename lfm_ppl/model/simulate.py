@@ -83,6 +83,7 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
     if concrete_times is not None and not checks.traced(model.initial_time):
         first = concrete_times[0] if model.initial_time is None else model.initial_time
         model.check_inputs(float(first), float(concrete_times[-1]))
+        event_table(model.events).check_start(float(first))
     model.check_at(times[0] if model.initial_time is None else model.initial_time, np.shape(times)[0])
     times = jnp.asarray(times, float)
     start = times[0] if model.initial_time is None else jnp.asarray(model.initial_time, float)
@@ -137,7 +138,7 @@ def _time_nodes(ssm: StateSpaceModel, start: jax.Array, times: jax.Array, breakp
     ``has_state``: whether the state at the start is given, so that events before an observation there have happened.
     """
     events = event_table(ssm.model.events)
-    event_times = jnp.asarray(events.times if events.traced_times is None else events.traced_times)
+    event_times = jnp.asarray(events.all_times)
     breakpoints = jnp.concatenate([jnp.asarray(breakpoints, float), event_times])
     count, breakpoint_count = times.shape[0], breakpoints.shape[0]
     if not breakpoint_count:

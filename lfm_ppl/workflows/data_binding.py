@@ -165,9 +165,10 @@ def check_requested_times(bound: BoundModel, times: Any, name: str = "at") -> No
         raise ValueError(f"{name} must have shape {expected}, got {np.shape(times)}.")
     data_times = bound.times if has_series_times else [bound.times]
     rows = times if np.ndim(times) == 2 else [times] * len(data_times)
-    for series, pair in enumerate(zip(data_times, rows, strict=True)):
+    members = bound.site.members if has_series_times else [example]
+    for series, (member, *pair) in enumerate(zip(members, data_times, rows, strict=True)):
         try:
-            build_time_grid(example.ssm, pair[0], example.steps, example.max_step, pair[1], tolerance=example.tolerance)
+            build_time_grid(member.ssm, pair[0], member.steps, member.max_step, pair[1], tolerance=member.tolerance)
         except ValueError as error:
             raise ValueError(f"series {series}: {error}" if has_series_times else str(error)) from None
 

@@ -220,6 +220,30 @@ def test_series_of_a_panel_have_doses_of_their_own():
     np.testing.assert_allclose(panel.log_prob(y), alone, rtol=1e-10)
 
 
+@pytest.mark.parametrize("times", [[0.0, 0.2, 0.9], [0.0, 0.3, 0.9]])
+@pytest.mark.parametrize("observation_first", [True, False])
+def test_a_dose_of_a_panel_at_the_last_observation(times, observation_first):
+    def build(p):
+        return absorption(1.3, 0.2, [lfm.Dose(p, 2.0, "blood", observation_first=observation_first)])
+
+    doses, times = np.array([[0.9], [0.9]]), np.array([times, times])
+    panel = lfm.panel(build, doses, times)
+    alone = lfm.MarginalLikelihood(build(doses[0]), times[0]).log_prob(np.ones((3, 1)))
+    np.testing.assert_allclose(panel.log_prob(np.ones((2, 3, 1))), alone, rtol=1e-10)
+
+
+def test_a_dose_before_the_start_of_a_series_is_refused():
+    def build(p):
+        return lfm.LatentForceModel(
+            lambda x, u, t: -x, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.ones(1)),
+            lfm.Gaussian(jnp.zeros(1), jnp.zeros(1)), events=[lfm.Dose(p, 1.0, "x0")])
+
+    with pytest.raises(ValueError, match="series 1"):
+        lfm.panel(build, np.array([[0.0], [4.0]]), np.array([[0.0, 1.0], [5.0, 6.0]]))
+    with pytest.raises(ValueError, match="initial time"):
+        lfm.simulate(jax.random.key(0), build(np.zeros(1)), np.array([1.0, 2.0]))
+
+
 def test_fit_and_forecast_with_a_dose_after_the_data():
     times = np.arange(1.0, 9.0)
     doses = np.array([0.0, 4.0, 10.0])
