@@ -79,13 +79,16 @@ def _doses(text: str | None, doses: Mapping[str, str]) -> dict[str, tuple[str, s
     """Return the columns of doses; the doses of a model to the same state keep their name."""
     if text is None:
         return {name: (name, way) for name, way in doses.items()}
-    columns = {}
+    columns: dict[str, tuple[str, str]] = {}
     for part in text.split(","):
         column, colon, state = (word.strip() for word in part.partition(":"))
         if not (column and colon and state):
             raise ValueError(f"--events takes COLUMN:STATE, the column of the doses and the state that receives them, "
                              f"got {part!r}.")
         name = next((name for name, way in doses.items() if way == DOSE + state), column)
+        if name in columns:
+            raise ValueError(f"--events names two columns for the doses {name!r} to {state}: {columns[name][0]} and "
+                             f"{column}. Write them in one column.")
         columns[name] = (column, DOSE + state)
     return columns
 

@@ -248,6 +248,9 @@ def _input(table: Table, name: str, interpolation: str, times: np.ndarray) -> In
     rows = np.flatnonzero(np.isfinite(values) & ~(is_dose & (values == 0)))
     unique_times, first, inverse = np.unique(times[rows], return_index=True, return_inverse=True)
     first_values = values[rows[first]]
+    if is_dose and (repeated := np.setdiff1d(np.arange(len(rows)), first)).size:
+        raise ValueError(f"{table.location(rows[repeated[0]], name)}: there are two doses at one time; write their sum "
+                         "in one row.")
     if (other_rows := rows[values[rows] != first_values[inverse]]).size:
         raise ValueError(f"{table.location(other_rows[0], name)}: the known input has another value at the same time.")
     return InputTable(unique_times, first_values, "previous" if interpolation == "zero" else interpolation)

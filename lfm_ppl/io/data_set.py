@@ -178,11 +178,13 @@ def _by_name(tables: Mapping[str, InputTable], make: Callable[[str, InputTable],
 
 
 def _padded(table: InputTable, size: int) -> InputTable:
-    """Return a table with ``size`` rows: doses of zero, or the last value, follow the last time."""
+    """Return a table with ``size`` rows: the last value follows the last time, doses of zero a time without end."""
     count = size - len(table.times)
-    times = np.append(table.times, table.times.max(initial=0.0) + np.arange(1, count + 1))
-    last = 0.0 if table.dosed_state else table.values[-1]
-    return table._replace(times=times, values=np.append(table.values, np.full(count, last)))
+    if table.dosed_state:
+        times, value = np.full(count, np.finfo(float).max), 0.0
+    else:
+        times, value = table.times[-1] + np.arange(1, count + 1), table.values[-1]
+    return table._replace(times=np.append(table.times, times), values=np.append(table.values, np.full(count, value)))
 
 
 def model_keywords(tables: Mapping[str, InputTable], model_kwargs: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -51,6 +51,12 @@ def test_doses_are_the_rows_with_an_amount(files):
     assert [event.state for event in keywords["events"]] == ["gut"]
 
 
+def test_two_doses_at_one_time_are_refused(files):
+    (files / "drug.csv").write_text("time,AMT,blood\n0,4,\n0,4,\n1,,1.8\n")
+    with pytest.raises(ValueError, match="their sum"):
+        lfm.read_csv(files / "drug.csv", ["blood"], inputs={"AMT": "dose:gut"})
+
+
 def test_doses_of_a_file_reach_the_fit_and_the_forecast(files, run):
     status, _, errors = run(f"fit {files}/drug.py --data {files}/drug.csv --events AMT:gut --out out --sampler map "
                             "--samples 50")
@@ -92,5 +98,6 @@ def test_subjects_of_a_file_are_fitted_together_with_their_doses(files, run):
     result = arviz_data.load("panel")
     doses = arviz_data.group(result, "constant_data")
     assert doses["AMT of series Ann"].values.tolist() == [4.0] and doses["AMT of series Bo"].values.tolist() == [4.0]
+    assert "trajectories" in arviz_data.groups(result)
     alone = arviz_data.group(lfm.select_series(result, "Ann"), "constant_data")
     assert list(alone) == ["AMT of series Ann"]
