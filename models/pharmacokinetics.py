@@ -67,7 +67,8 @@ def build(absorption, lag, clearance, volume, scale, lengthscale, noise_sd, exch
         return jnp.stack([-absorbed, change - flow, flow])
 
     names = ("gut", "blood") if exchange is None else ("gut", "blood", "tissue")
-    delayed = [lfm.Dose(event.times, event.values, event.state, lag=lag) for event in events]
+    delayed = [lfm.Dose(event.times, event.values, "gut", event.lag + lag, event.observation_first)
+               if event.state == "gut" and not event.is_reset else event for event in events]
     return lfm.LatentForceModel(
         dynamics=dynamics,
         forces={"u": lfm.Matern(scale=scale, lengthscale=lengthscale, order=1)},
@@ -86,7 +87,7 @@ def model(times, y=None, events=(), compartments: int = 1, units=None) -> None:
     Args:
         times: observation times, shape (T,); the first one is that of the first dose or earlier.
         y: concentrations, shape (T, 1); NaN is missing, None draws from the prior predictive.
-        events: the doses, `lfm.Dose` to the state "gut".
+        events: the doses, `lfm.Dose`; those to the state "gut" begin to be absorbed after the lag.
         compartments: 1 or 2.
         units: name -> unit, for plots.
     """
