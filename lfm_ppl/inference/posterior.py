@@ -206,7 +206,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     if is_shared:
         # Where the path is simulated the smoother stays at the last row of the data, at no cost.
         reached = plan.times if plan.times is None or not is_forecast else np.minimum(plan.times, bound.times.max())
-        inputs = None if reached is None else bound.traced.lay_out(reached)
+        inputs = None if reached is None else bound.traced.lay_out(bound.site.name, reached)
         name = (*name, len(plan.requested), plan.rows, at is None, plan.steps if is_forecast else None)
         paths = map_draws(bound, name, SharedFunction(shared_per_draw, (plan.times, inputs)), draws, key,
                           rows=plan.rows, **options)

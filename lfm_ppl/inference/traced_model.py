@@ -149,7 +149,7 @@ class TracedModel:
         return times
 
     def _recorded(self, measure: Callable[[Any], Any], model: Callable, transformation: Callable,
-                  *arguments: Any) -> dict[str, Any]:
+                  *arguments: Any, only_site: str | None = None) -> dict[str, Any]:
         """Return what ``measure`` says of each likelihood in a transformed run of a model, by site.
 
         Args:
@@ -157,6 +157,7 @@ class TracedModel:
             model: this model, seeded.
             transformation: such as `jax.eval_shape`, of a function of z and y.
             *arguments: its further arguments, z (d,) and y.
+            only_site: name of the site whose likelihood is measured; None: of all sites.
         """
         recorder, results = record_likelihoods(model), {}
 
@@ -164,19 +165,19 @@ class TracedModel:
             if isinstance(y, ModelArguments):
                 recorder.fn = self.with_times(y)
             density = potential_energy(recorder, *self.call(y), self.unravel(z))
-            results.update({name: measure(likelihood) for name, likelihood in recorder.likelihoods.items()})
+            results.update({name: measure(likelihood) for name, likelihood in recorder.likelihoods.items()
+                            if only_site in (None, name)})
             return density
 
         transformation(run, *arguments)
         return results
 
-    def lay_out(self, at: np.ndarray) -> ModelInputs | None:
-        """Return the layout with requested times (K,), an argument of programs; None where programs need the times."""
-        if self.inputs is None or len(self.likelihoods) != 1:
-            return None
-        (layout,) = self._recorded(lambda likelihood: likelihood.lay_out(at), self.with_times(self._example),
-                                   jax.eval_shape, jnp.zeros(self.size), shapes(self._example)).values()
-        return ModelInputs.of((), layout.padded())
+    def lay_out(self, site: str, at: np.ndarray) -> ModelInputs:
+        """Return the layout of a site with requested times (K,), an argument of `programs`."""
+        # Other sites may have later initial times, or known inputs that end before the requested times.
+        recorded = self._recorded(lambda likelihood: likelihood.lay_out(at), self.with_times(self._example),
+                                  jax.eval_shape, jnp.zeros(self.size), shapes(self._example), only_site=site)
+        return ModelInputs.of((), recorded[site].padded())
 
     def share_programs(self, identity: Hashable) -> TracedModel:
         """Make times, arrays among the arguments and time grids arguments of programs, if the model can be traced so.
