@@ -100,7 +100,10 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
     clocks = {name: known_inputs.clock_of(view) for name, view in views.items()}
     requested = {name: _checked(calendar_time.positions("times", values, *clocks[name]))
                  for name, values in requested.items() if values is not None}
-    keywords = rebuilding.keywords(result, inputs, model_kwargs)
+    later: Mapping[str, Any] = inputs or {}
+    if sites:
+        later = {name: of_site("inputs", inputs, name, sites) for name in sites}
+    keywords = rebuilding.keywords(result, later, model_kwargs)
     with calendar_time.in_messages(*next(iter(clocks.values()))):
         problem = rebuilding.problem(result, numpyro_model, model_kwargs=keywords)
     groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)}
@@ -109,7 +112,7 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
         suffix = f"_{name.replace('/', '.')}" if sites else ""
         with calendar_time.in_messages(*clocks[name]):
             new = _forecast(key, views[name], problem.sites[name] if sites else problem, requested[name],
-                            (inputs or {}).get(name, {}) if sites else inputs, draws, progress)
+                            later[name] if sites else later, draws, progress)
         # Held-out data of an earlier forecast do not belong to this one.
         for group in (HELD_OUT, known_inputs.FORECAST):
             groups.pop(f"{group}{suffix}", None)

@@ -200,6 +200,8 @@ def test_known_inputs_reach_their_site():
     longer = lfm.Input(np.array([0.0, 2.0, 7.0]), np.array([0.5, 0.0, 1.0]))
     ahead = lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"a": {"heat": longer}}, progress=False)
     assert {"predictions_a", "predictions_constant_data_a"} <= set(arviz_data.groups(ahead))
+    with pytest.raises(ValueError, match="inputs: unknown likelihood site 'heat'.*a, b"):
+        lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"heat": longer}, progress=False)
 
 
 def test_a_finished_fit_is_read_again(fitted, folder):
