@@ -12,7 +12,9 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.posterior import noise_of_rows
+from lfm_ppl.io.data import as_data
 from lfm_ppl.io.data_set import Data, at_origin, keywords_by_site, model_keywords
+from lfm_ppl.io.table import is_table
 from lfm_ppl.utils import calendar_time, checks
 
 
@@ -54,15 +56,31 @@ def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
 
 
 def data_by_site(times: Any, y: Any) -> dict[str, Any] | None:
-    """Return the data of each likelihood site, from a dict of data or from two dicts; None for data of one site."""
+    """Return the data of each likelihood site, from a dict of data or from two dicts; None for data of one site.
+
+    Raises:
+        TypeError: some entries of the dict are data of a site and others are not.
+    """
     if not isinstance(times, Mapping) or not times:
         return None
     if isinstance(y, Mapping):
         return {name: (values, y.get(name)) for name, values in times.items()}
     # A dict of columns is a table, of one site.
-    is_of_site = [isinstance(value, Data) or isinstance(value, tuple) and len(value) == 2 and np.ndim(value[0]) > 0
-                  for value in times.values()]
-    return dict(times) if y is None and all(is_of_site) else None
+    if y is not None or not any(map(_is_of_site, times.values())):
+        return None
+    for name, value in times.items():
+        if not _is_of_site(value):
+            raise TypeError(f"the data of the likelihood site {name!r} must be lfm.Data, a DataFrame or a pair (times, "
+                            f"y), as those of other sites are, got {type(value).__name__}.")
+    return {name: tuple(value) if isinstance(value, list) else value if isinstance(value, tuple) else as_data(value)
+            for name, value in times.items()}
+
+
+def _is_of_site(value: Any) -> bool:
+    """Return whether a value is the data of a site, `Data`, a table or a pair of times and y; not a column."""
+    if isinstance(value, (tuple, list)):
+        return len(value) == 2 and np.ndim(value[0]) > 0
+    return isinstance(value, (Data, Mapping)) or is_table(value) and hasattr(value, "columns")
 
 
 def of_site(argument: str, value: Any, name: str, sites: Collection[str]) -> Any:

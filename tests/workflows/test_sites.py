@@ -12,6 +12,7 @@ import lfm_ppl as lfm
 from lfm_ppl.inference.posterior import trajectories
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.plots import save_figures
+from lfm_ppl.workflows.data_binding import data_by_site
 
 TIMES = {"a": np.arange(6.0), "b": np.arange(0.0, 4.0, 0.5)}
 Y = {"a": np.exp(-0.4 * TIMES["a"])[:, None],
@@ -202,6 +203,18 @@ def test_known_inputs_reach_their_site():
     assert {"predictions_a", "predictions_constant_data_a"} <= set(arviz_data.groups(ahead))
     with pytest.raises(ValueError, match="inputs: unknown likelihood site 'heat'.*a, b"):
         lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"heat": longer}, progress=False)
+
+
+def test_data_by_site_are_told_from_columns():
+    frame = pd.DataFrame({"time": TIMES["a"], "level": Y["a"][:, 0]})
+    for pair in ((TIMES["b"], Y["b"]), [TIMES["b"], Y["b"]]):
+        sites = data_by_site({"a": frame, "b": pair}, None)
+        assert sites["a"].outputs == ("level",) and isinstance(sites["b"], tuple)
+    for columns in ({"time": TIMES["a"], "level": Y["a"][:, 0]}, dict(frame), {"time": [0.0, 1.0], "level": (2.0, 3.0)},
+                    frame.set_index("time").to_xarray()):
+        assert data_by_site(columns, None) is None
+    with pytest.raises(TypeError, match="site 'b'.*got ndarray"):
+        lfm.fit(both, {"a": DATA["a"], "b": Y["b"]}, progress=False)
 
 
 def test_a_finished_fit_is_read_again(fitted, folder):
