@@ -84,9 +84,19 @@ def structured(times, y=None, gain=None):
         system(lambda x, u, t: u - rate * x + gain @ x**2, jnp.array([0.1 + lag])), times, steps=2), obs=y)
 
 
-@pytest.mark.parametrize("model", [branching, structured])
+def filtered(times, y=None, gain=None):
+    """A model with a filter beside its likelihood, whose steps depend on the gaps between times."""
+    lag, rate = parameters()
+    built = system(lambda x, u, t: u - rate * x + gain @ x**2, jnp.array([0.1 + lag]))
+    numpyro.factor("filtered", lfm.filter(built, times, Y, steps=2).log_likelihood.sum())
+    numpyro.sample("y", lfm.MarginalLikelihood(built, times, steps=2, iterations=0), obs=y)
+
+
+@pytest.mark.parametrize("model", [
+    filtered, pytest.param(branching, marks=pytest.mark.slow), pytest.param(structured, marks=pytest.mark.slow)])
 def test_a_model_that_needs_values_is_compiled_for_them(model):
-    for times, gain in ((TIMES, 0.1), (TIMES, 0.0), (1.1 * TIMES, 0.1)):
+    cases = [(TIMES, 0.1), (1.1 * TIMES + 20.0 * (TIMES == 8.0), 0.1), (TIMES, 0.0)]
+    for times, gain in cases[:2] if model is filtered else cases:
         keywords = {"gain": np.full((1, 1), gain)}
         expected = -jax.jit(lambda z: potential_energy(model, (times, Y), keywords, z))(  # noqa: B023
             {"lag": Z[0], "rate": Z[1]})
