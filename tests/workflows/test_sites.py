@@ -35,14 +35,12 @@ def both(times, y):
         numpyro.sample(name, likelihood(name, rate, times[name]), obs=y[name])
 
 
-def decay(name, rate, times):
-    """Return the likelihood of a decay, non-linear at the site "a" and with a longest step at the site "b"."""
-    power = {"a": 3, "b": 1}[name]
+def cubic(rate, times):
     system = lfm.LatentForceModel(
-        lambda x, u, t: u - rate * x**power, {"f": lfm.Matern(0.1, 2.0)},
+        lambda x, u, t: u - rate * x**3, {"f": lfm.Matern(0.1, 2.0)},
         lfm.GaussianObservation(lambda x, u, t: x, 0.01 * jnp.ones(1)),
-        lfm.Gaussian(jnp.ones(1), 0.01 * jnp.eye(1)), initial_time=times[0])
-    return lfm.MarginalLikelihood(system, times, max_step={"a": None, "b": 0.3}[name])
+        lfm.Gaussian(jnp.ones(1), 0.01 * jnp.eye(1)))
+    return lfm.MarginalLikelihood(system, times, lfm.Taylor(), max_step=0.4, iterations=0)
 
 
 DATA = {"a": lfm.Data(TIMES["a"], Y["a"], ("level",), units={"time": "h"}), "b": (TIMES["b"], Y["b"])}
@@ -130,26 +128,24 @@ def test_forecast_and_score_by_site(fitted):
 
 
 def test_paths_of_a_site_are_those_of_its_model_alone():
-    times = {"a": np.arange(5.0), "b": np.arange(2.0, 6.0)}
-    y = {name: np.exp(-0.4 * (times[name] - times[name][0]))[:, None] for name in times}
-    y["a"][-1] = np.nan
-    at = {"a": np.array([0.5, 3.5, 4.0, 6.0]), "b": np.array([2.5, 7.0])}  # "a" begins before "b" does
+    times = {"a": np.arange(2.0, 6.0), "b": np.arange(5.0)}
+    y = {"a": Y["a"][:4], "b": np.append(np.exp(-0.4 * times["b"][:-1]), np.nan)[:, None]}
+    at = np.array([0.5, 3.5, 4.0, 6.0])  # before the first time of the other site, and after the last observation
 
     def two(times, y):
         rate = numpyro.sample("rate", dist.LogNormal(-1.0, 0.5))
-        for name in ("a", "b"):
-            numpyro.sample(name, decay(name, rate, times[name]), obs=y[name])
+        numpyro.sample("a", likelihood("a", rate, times["a"]), obs=y["a"])
+        numpyro.sample("b", cubic(rate, times["b"]), obs=y["b"])
 
-    draws, key, sites = {"rate": np.array([0.3, 0.5])}, jax.random.key(1), lfm.bind(two, times, y).site_models
-    for name in times:
-        def alone(times, y, name=name):
-            numpyro.sample("y", decay(name, numpyro.sample("rate", dist.LogNormal(-1.0, 0.5)), times), obs=y)
+    def alone(times, y):
+        numpyro.sample("y", cubic(numpyro.sample("rate", dist.LogNormal(-1.0, 0.5)), times), obs=y)
 
-        paths = trajectories(key, sites[name], draws, at[name])
-        expected = trajectories(key, lfm.bind(alone, times[name], y[name]), draws, at[name])
-        assert paths["state"].shape == (2, len(at[name]), 1)
-        for variable in ("state", "force", "output", "log_likelihood"):
-            np.testing.assert_allclose(paths[variable], expected[variable], atol=1e-9)
+    paths, expected = (
+        trajectories(jax.random.key(1), bound, {"rate": np.array([0.3, 0.5])}, at)
+        for bound in (lfm.bind(two, times, y).site_models["b"], lfm.bind(alone, times["b"], y["b"])))
+    assert paths["state"].shape == (2, 4, 1)
+    for name in ("state", "force", "output", "y", "log_likelihood"):
+        np.testing.assert_allclose(paths[name], expected[name], atol=1e-9)
 
 
 def test_the_check_adds_the_sites(fitted):
