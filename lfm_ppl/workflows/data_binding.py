@@ -70,8 +70,8 @@ def data_by_site(times: Any, y: Any) -> dict[str, Any] | None:
         return None
     for name, value in times.items():
         if not _is_of_site(value):
-            raise TypeError(f"the data of the likelihood site {name!r} must be lfm.Data, a DataFrame or a pair (times, "
-                            f"y), as those of other sites are, got {type(value).__name__}.")
+            raise TypeError(f"the data of the likelihood site {name!r} must be lfm.Data, a DataFrame or a pair "
+                            f"(times, y), got {type(value).__name__}.")
     return {name: tuple(value) if isinstance(value, list) else value if isinstance(value, tuple) else as_data(value)
             for name, value in times.items()}
 
