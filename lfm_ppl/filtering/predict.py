@@ -130,7 +130,9 @@ def predict_interval(dynamics: Dynamics, factor: IntegratingFactor, steps: int, 
         index, points = inputs
         rest_of_span = span.shifted(index * h)
         if is_exponential:
-            step, _ = exponential_step(dynamics, rest_of_span, h, previous.moments, min_sd, points)
+            # A fast state settles during the interval.
+            min_sd_of_step = minimum_sd(dynamics, factor, rest_of_span.time(), h, previous.moments)
+            step, _ = exponential_step(dynamics, rest_of_span, h, previous.moments, min_sd_of_step, points)
         else:
             step, _ = runge_kutta_step(dynamics, factor, rest_of_span, h, previous.moments, min_sd, points)
         return advance(previous, step)

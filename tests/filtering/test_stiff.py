@@ -88,6 +88,16 @@ def test_a_stiff_linear_system_with_a_known_input():
     np.testing.assert_allclose(predicted, np.interp(times, [0, 0.3, 1], [0, 1, 0.5]) - lag, atol=1e-10)
 
 
+@pytest.mark.parametrize("options", [{"steps": 100}, {"steps": 100, "tolerance": 1e-3}], ids=["steps", "tolerance"])
+def test_a_known_stiff_state_far_from_equilibrium(options):
+    model = lfm.LatentForceModel(
+        lambda x, u, t: 1e7 * (1 - x**3), {}, lfm.GaussianObservation(lambda x, u, t: x, 1e-4 * jnp.ones(1)),
+        lfm.Gaussian(jnp.array([0.1]), jnp.zeros((1, 1))), events=[lfm.Dose([1.0], 4.0, "x0")])
+    result = lfm.filter(model, np.array([0.0, 1.0, 2.0]), np.ones((3, 1)), method="exponential", **options)
+    np.testing.assert_allclose(result.predicted_mean[1:], 1.0, rtol=1e-10)
+    np.testing.assert_allclose(result.predicted_covariance[1:], 0.0, atol=1e-10)
+
+
 def van_der_pol(mu=1.0, noise=0.3, start=1.0):
     return lfm.LatentForceModel(
         lambda x, u, t: jnp.stack([x[1], mu * (1 - x[0] ** 2) * x[1] - x[0] + jnp.sin(u[0])]),
