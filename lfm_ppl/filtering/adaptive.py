@@ -68,13 +68,13 @@ class _Position(NamedTuple):
         remaining: length of the interval that is left.
         trial: length of the next attempt.
         prediction: up to here.
-        stage: linearised dynamics here, the first stage of the next step.
+        stage: linearised dynamics here, the first stage of the next step; None for exponential steps.
     """
 
     remaining: jax.Array
     trial: jax.Array
     prediction: Prediction
-    stage: DriftLinearization
+    stage: DriftLinearization | None
 
 
 def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float, span: Span, length: jax.Array,
@@ -95,24 +95,25 @@ def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float
     min_sd = minimum_sd(dynamics, factor_of_interval, span.time(), length, moments)
 
     is_exponential = dynamics.method == EXPONENTIAL
+    exponent = -1 / 3 if is_exponential else -1 / 4  # The estimated error of a step is of order h^3 or h^4.
 
     def linearize_at(t: jax.Array, moments: Moments) -> DriftLinearization:
         return linearize_drift(dynamics, t, moments.mean, covariance_of(moments), min_sd)
 
     def attempt(position: _Position) -> _Position:
         trial = position.trial
-        if not is_exponential:
+        if position.stage is not None:
             # Where this is shorter, a rejected step stays finite, and so does its derivative, which is not used.
             trial = stop(jnp.minimum(trial, _STABILITY_LIMIT / fastest_rate(position.stage.jacobian)))
         is_last = trial >= position.remaining
         h = jnp.where(is_last, position.remaining, trial)
         rest_of_span = span.shifted(length - position.remaining)
         previous = position.prediction
+        stage5 = None
         if is_exponential:
             # A fast state settles during the interval.
             min_sd_of_step = minimum_sd(dynamics, factor_of_interval, rest_of_span.time(), h, previous.moments)
             step, coarse = exponential_step(dynamics, rest_of_span, h, previous.moments, min_sd_of_step)
-            stage5 = position.stage
             mean_error, covariance_error = jax.tree.map(jnp.subtract, step.moments, coarse)
         else:
             factor = integrating_factor(ssm, dynamics.linear, h)
@@ -123,7 +124,7 @@ def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float
         error = stop(_in_standard_deviations(mean_error, covariance_error, previous.moments, step.moments)) / tolerance
         # A step that is not finite is far too long, and is repeated.
         error = jnp.where(jnp.isfinite(error), error, jnp.inf)
-        growth = jnp.clip(_SAFETY * jnp.maximum(error, 1e-12) ** -0.25, _MIN_GROWTH, _MAX_GROWTH)
+        growth = jnp.clip(_SAFETY * jnp.maximum(error, 1e-12) ** exponent, _MIN_GROWTH, _MAX_GROWTH)
         phi, process_cov = previous.phi, previous.process_cov
         if has_map:
             phi, process_cov = compose((phi, process_cov), (step.phi, step.process_cov))
@@ -146,7 +147,7 @@ def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float
     is_finite = jnp.isfinite(moments.mean).all() & jnp.isfinite(moments.covariance).all()
     start = _Position(jnp.where(is_finite, length, 0.0), stop(_INITIAL_FRACTION * length),
                       identity_prediction(dynamics, moments, Record.SMOOTHER if has_map else Record.LIKELIHOOD),
-                      linearize_at(span.time(), moments))
+                      None if is_exponential else linearize_at(span.time(), moments))
     body = jax.checkpoint(unless_finished(block), prevent_cse=False)
     end, _ = jax.lax.scan(body, start, None, length=-(-_ATTEMPTS_PER_STEP * steps // _BLOCK))
     reached = jax.tree.map(lambda a: jnp.where(end.remaining > 0, jnp.nan, a), end.prediction.moments)
