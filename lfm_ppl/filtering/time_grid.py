@@ -32,7 +32,7 @@ from lfm_ppl.filtering.grid_layout import (
     time_scale,
 )
 from lfm_ppl.filtering.intervals import TimeGrid, intervals_between
-from lfm_ppl.model.events import EventTable, event_table
+from lfm_ppl.model.events import EventTable, check_start, event_table
 from lfm_ppl.model.inputs import InputRead, breakpoints_within
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, inset
 from lfm_ppl.utils import checks
@@ -148,7 +148,7 @@ def _concrete_layout(ssm: StateSpaceModel, times: np.ndarray, origin: float, req
         scale=0.0 if checks.traced(scale) else scale,
         overhead=_OVERHEAD_OF_EXACT if ssm.time_invariant else _OVERHEAD,
         is_exact=ssm.mean_invariant and division.max_step is None and not division.interval_per_step)
-    events.check_start(origin)
+    check_start(events.times, origin)
     grid = _divide_times(times, origin, ssm.stack.jump_times, requested, division, events)
     is_lagged = tuple(checks.traced(read.breakpoints()) for read in reads)
     return GridLayout(grid, tuple(read.breakpoint_rows for read in reads), is_lagged,

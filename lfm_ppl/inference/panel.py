@@ -24,7 +24,7 @@ from lfm_ppl.filtering.intervals import RUNGE_KUTTA
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, refuse_times_by_site, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.model.events import event_table
+from lfm_ppl.model.events import check_start, event_table
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import check_times
@@ -90,19 +90,21 @@ class Panel(dist.Distribution):
     def _check_events(self, count: int) -> None:
         """Raise ValueError if an event of a series lies before its initial time."""
 
-        def first_event(parameters: Any, times: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def event_times(parameters: Any, times: jax.Array) -> tuple[jax.Array, jax.Array]:
             model = self.build(parameters)
             start = times[0] if model.initial_time is None else jnp.asarray(model.initial_time)
-            return jnp.min(jnp.asarray(event_table(model.events).all_times), initial=jnp.inf), start
+            return jnp.asarray(event_table(model.events).all_times), start
 
         parameters = jax.tree_util.tree_map(jnp.asarray, self.parameters)
         times = jnp.broadcast_to(jnp.asarray(self.times, float), (count, np.shape(self.times)[-1]))
-        first, start = jax.vmap(first_event)(parameters, times)
-        if checks.traced((first, start)) or not (first < start).any():  # build may close over traced parameters
+        events, starts = jax.vmap(event_times)(parameters, times)
+        if checks.traced((events, starts)):  # build may close over traced parameters
             return
-        series = int(np.argmax(first < start))
-        raise ValueError(f"series {series}: an event at time {first[series]:g} lies before the initial time "
-                         f"{start[series]:g} of the model; set initial_time to the time of the first event or earlier.")
+        for series, (row, start) in enumerate(zip(np.asarray(events), np.asarray(starts), strict=True)):
+            try:
+                check_start(row, float(start))
+            except ValueError as error:
+                raise ValueError(f"series {series}: {error}") from None
 
     @property
     def first(self) -> SeriesLikelihood:

@@ -274,41 +274,41 @@ def _plan(bound: BoundModel, requested_times: np.ndarray | None, simulated: bool
         since: time, or times (B,) where series have their own.
     """
     if requested_times is None or bound.times.ndim == 1:
-        return _plan_of(bound, bound.times, requested_times, simulated, float(np.min(since)))
+        return _plan_of(bound.site.example, bound.times, requested_times, simulated, float(np.min(since)))
     requested_times = np.broadcast_to(requested_times, (len(bound.times), requested_times.shape[-1]))
-    plans = [_plan_of(bound, times, requested, simulated, float(start))
-             for times, requested, start in zip(bound.times, requested_times, since, strict=True)]
+    members = bound.site.members
+    plans = [_plan_of(series, times, requested, simulated, float(start))
+             for series, times, requested, start in zip(members, bound.times, requested_times, since, strict=True)]
     length = max(plan.rows for plan in plans)
     count, data = requested_times.shape[1], plans[0].data.size
     # The first requested time pads the times between requested ones, of which series have different numbers.
     rows = [np.insert(times, count, np.repeat(times[0], length - len(times)))
             for times in (plan.times for plan in plans) if times is not None]
     smoother_steps = [_steps_per_interval(series.ssm, times, row, series.steps)
-                      for series, times, row in zip(bound.site.members, bound.times, rows, strict=True)]
+                      for series, times, row in zip(members, bound.times, rows, strict=True)]
     return _Plan(np.array(rows), plans[0].requested, np.arange(length - data, length),
                  max(plan.steps for plan in plans), max(smoother_steps))
 
 
-def _plan_of(bound: BoundModel, times: np.ndarray, requested_times: np.ndarray | None, simulated: bool,
+def _plan_of(series: SeriesLikelihood, times: np.ndarray, requested_times: np.ndarray | None, simulated: bool,
              since: float) -> _Plan:
-    """Return the rows of series with these times; arguments as in `_plan`."""
-    example = bound.site.example
+    """Return the rows of a series, or of all series with common times; arguments as in `_plan`."""
     gaps = np.diff(times, axis=-1)
-    base = example.steps
-    if example.max_step is not None:
-        base = max(base, int(np.ceil(gaps.max(initial=0.0) / example.max_step * (1 - 1e-12))))
-    fine = SIMULATION_STEPS * base * (1 if example.tolerance is None else _ADAPTIVE_FACTOR)
+    base = series.steps
+    if series.max_step is not None:
+        base = max(base, int(np.ceil(gaps.max(initial=0.0) / series.max_step * (1 - 1e-12))))
+    fine = SIMULATION_STEPS * base * (1 if series.tolerance is None else _ADAPTIVE_FACTOR)
     rows = np.arange(times.shape[-1])
     if requested_times is None:
         return _Plan(None, rows, rows, fine)
     beyond = np.array([])
-    needs_steps = simulated or not example.ssm.mean_invariant
+    needs_steps = simulated or not series.ssm.mean_invariant
     if needs_steps and requested_times.max() > times[-1] and (gaps > 0).any():
         gap = np.median(gaps[gaps > 0])
         count = min(int(np.ceil((requested_times.max() - times[-1]) / gap * (1 - 1e-12))), LONGEST_FORECAST)
         beyond = np.linspace(times[-1], requested_times.max(), count + 1)[1:-1]
     path_times = np.concatenate([requested_times, beyond])
-    steps = _steps_per_interval(example.ssm, times, path_times, fine, since) if simulated else fine
+    steps = _steps_per_interval(series.ssm, times, path_times, fine, since) if simulated else fine
     first = len(path_times)
     return _Plan(np.concatenate([path_times, times]), np.arange(len(requested_times)), first + rows, steps)
 
@@ -337,10 +337,9 @@ def _simulate_forecast(distribution: SeriesLikelihood, states: jax.Array, when: 
     """Return the joint states (L, n), simulated after the last smoothed one; ``is_smoothed`` is (L,)."""
     order = jnp.arange(plan.rows) if plan.times is None else jnp.argsort(when, stable=True)
     # Breakpoints before the first time or after the last one change nothing.
-    layout, reads = distribution.layout, distribution.model.input_reads(0.0, 1.0)
-    # A read at another function of time than t - lag may be seen in one span of time, and not in another.
-    breakpoints = (input_breakpoints(distribution.model, None, None) if layout is None or len(reads) != len(layout.rows)
-                   else layout.breakpoints(reads))
+    layout = distribution.layout
+    breakpoints = (input_breakpoints(distribution.model, None, None) if layout is None
+                   else layout.breakpoints(distribution.model.input_reads(0.0, 1.0)))
     path = simulate_missing_states(distribution.ssm, key, states[order], when[order], is_smoothed[order], plan.steps,
                                    breakpoints)
     return jnp.zeros_like(states).at[order].set(path)

@@ -319,7 +319,10 @@ def _structure(likelihood: MarginalLikelihood) -> Hashable:
 
 
 def _traced_structure(likelihood: MarginalLikelihood) -> Hashable:
-    """Return the same where times and inputs are traced; raise ValueError if its inputs are read in another way."""
+    """Return `_structure` where times and inputs are traced; raise ValueError if inputs are read in another way."""
+    # A read at another function of time than t - lag may be seen in one span of time, and not in another.
+    if likelihood.layout is not None and len(likelihood.model.input_reads(0.0, 1.0)) != len(likelihood.layout.rows):
+        raise ValueError("the reads of known inputs depend on the times.")
     _ = likelihood.time_grid
     return _structure(likelihood)
 

@@ -201,11 +201,12 @@ class EventTable(NamedTuple):
         is_past = (self.times < start) | ((self.times == start) & ~self.observation_first)
         return self._replace(times=np.where(is_past, np.nan, self.times))
 
-    def check_start(self, origin: float) -> None:
-        """Raise ValueError if an event lies before the initial time."""
-        if np.any(self.times < origin):
-            raise ValueError(f"an event at time {np.nanmin(self.times):g} lies before the initial time {origin:g} of "
-                             "the model; set initial_time to the time of the first event or earlier.")
+
+def check_start(times: np.ndarray, origin: float) -> None:
+    """Raise ValueError if an event lies before the initial time."""
+    if np.any(times < origin):
+        raise ValueError(f"an event at time {np.nanmin(times):g} lies before the initial time {origin:g} of the model; "
+                         "set initial_time to the time of the first event or earlier.")
 
 
 def event_table(events: Sequence[Event]) -> EventTable:

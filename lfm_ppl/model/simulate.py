@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.model.events import StateMap, event_table
+from lfm_ppl.model.events import StateMap, check_start, event_table
 from lfm_ppl.model.inputs import breakpoints_within
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import noisy_observation
@@ -83,7 +83,7 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
     if concrete_times is not None and not checks.traced(model.initial_time):
         first = concrete_times[0] if model.initial_time is None else model.initial_time
         model.check_inputs(float(first), float(concrete_times[-1]))
-        event_table(model.events).check_start(float(first))
+        check_start(event_table(model.events).times, float(first))
     model.check_at(times[0] if model.initial_time is None else model.initial_time, np.shape(times)[0])
     times = jnp.asarray(times, float)
     start = times[0] if model.initial_time is None else jnp.asarray(model.initial_time, float)

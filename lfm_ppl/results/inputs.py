@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.io.data_set import Data, InputTable, keywords_by_site, model_keywords
+from lfm_ppl.io.data_set import Data, InputTable
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.scalars import unit_of, units_attribute
-from lfm_ppl.results.sites import select_site
 
 GROUP = "constant_data"
 """ArviZ's name for what a model is given beside the observations."""
@@ -45,13 +44,6 @@ def inputs_of(result: Any, group: str = GROUP) -> dict[str, InputTable]:
 def input_unit(result: Any, name: str) -> str:
     """Return the unit of a known input, empty where the result does not know it."""
     return unit_of(arviz_data.group(result, GROUP)[name]) if name in inputs_of(result) else ""
-
-
-def keywords(result: Any, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the keyword arguments of the model of a result: those given, and its known inputs, by site if it is so."""
-    if sites := {name: keywords(select_site(result, name), None) for name in arviz_data.sites_of(result)}:
-        return keywords_by_site(sites) | dict(overrides or {})
-    return model_keywords(inputs_of(result), overrides)
 
 
 def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | None, unit: str) -> dict[str, Any]:

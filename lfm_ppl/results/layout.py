@@ -23,7 +23,7 @@ from lfm_ppl.io.truth import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
 from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, PERIODS, mixture_quantiles, predictions
 from lfm_ppl.results.scalars import DERIVED, units_attribute
-from lfm_ppl.results.series import SERIES, TIMES, plate_dimension
+from lfm_ppl.results.series import SERIES, plate_dimension, time_coordinate
 from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:
@@ -165,7 +165,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
     panel = () if labels.series is None else (labels.series,)
     along = (*panel, "time")
     coords: dict[str, Any] = {"chain": np.arange(chains), "draw": np.arange(samples)}
-    clock: dict[str, Any] = _clock("time", times, panel, units)
+    clock: dict[str, Any] = time_coordinate("time", times, panel, units)
     outputs = labels.coords.get(OUTPUT, list(model.output_names))
     units = units | {new: units[old] for old, new in zip(model.output_names, outputs, strict=True) if old in units}
     named = {"output": outputs, "state": list(model.state_names), "force": list(model.force_names),
@@ -199,7 +199,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
         groups["posterior_predictive"] = xr.Dataset(
             {site.name: variable((*sample, "output"), paths["y"], named["output"])}, {**thinned, **observed_coords})
         dimensions = ("chain", "draw", *panel, "at")
-        at_coords = {} if grid is None else _clock("at", grid, panel, units)
+        at_coords = {} if grid is None else time_coordinate("at", grid, panel, units)
         groups["trajectories"] = xr.Dataset(
             {f"{kind}s": variable((*dimensions, kind), paths[kind], named[kind])
              for kind in named if paths[kind].shape[-1]},
@@ -219,12 +219,6 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
                 truth_group = truth_group.drop_dims(kind)
             groups["truth"] = truth_group.assign(new).assign_coords({kind: named[kind]})
     return groups
-
-
-def _clock(name: str, times: np.ndarray, panel: tuple[str, ...], units: Mapping[str, str]) -> dict[str, Any]:
-    """Return the coordinate of times along a dimension, (K,), or (B, K) of series that have their own."""
-    label, dims = (name, (name,)) if times.ndim == 1 else (TIMES, (*panel, name))
-    return {label: (dims, times, units_attribute(["time"], units))}
 
 
 def force_periods(model: LatentForceModel) -> dict[str, float]:

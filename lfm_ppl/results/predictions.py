@@ -18,6 +18,7 @@ from scipy import special
 
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.scalars import units_attribute
+from lfm_ppl.results.series import time_coordinate
 
 if TYPE_CHECKING:  # figures, which read predictions, need no JAX
     from lfm_ppl.inference.bound_model import BoundModel
@@ -84,8 +85,7 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], draw_index: 
     words = {"output": NOISE_FREE, "state": "state", "force": "force", "deterministic": "of state and forces"}
     variables |= {f"{kind}s": variable(kind, paths[kind], word) for kind, word in words.items()
                   if paths[kind].shape[-1]}
-    clock = {("times" if np.ndim(times) == 2 else "time"): (
-        (*panel, "time")[-np.ndim(times):], times, units_attribute(["time"], units))}
+    clock = time_coordinate("time", times, panel, units)
     coords = {"chain": np.arange(paths["prediction"].shape[0]), "draw": draw_index, **clock}
     coords |= {name: labels[name] for name in panel if name in labels}
     attrs = {"observed": site.name, "last_observation": float(last_observation(bound.times, np.asarray(bound.y)))}

@@ -44,7 +44,13 @@ def observations(result: Any) -> tuple[Any, Any]:
 
 
 def keywords(result: Any, later: Mapping[str, Any] | None, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the keyword arguments of a result's model with known inputs that reach further; see `lfm_ppl.forecast`."""
+    """Return the keyword arguments of a result's model, by site where it has several.
+
+    Args:
+        result: with the known inputs of the fit.
+        later: known inputs that reach further, see `lfm_ppl.forecast`; None: those of the fit.
+        overrides: keyword arguments that replace these.
+    """
     if sites := arviz_data.sites_of(result):
         return keywords_by_site({name: keywords(select_site(result, name), (later or {}).get(name), None)
                                  for name in sites}) | dict(overrides or {})
@@ -75,7 +81,7 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
     if times is None or y is None:
         stored = observations(result)
         times, y = stored[0] if times is None else times, stored[1] if y is None else y
-    arguments = inputs.keywords(result, model_kwargs)
+    arguments = keywords(result, None, model_kwargs)
     try:
         bound = bind(numpyro_model, times, y, **arguments)
     except (TypeError, AttributeError) as error:

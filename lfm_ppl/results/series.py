@@ -16,6 +16,7 @@ import xarray as xr
 
 from lfm_ppl.io.data_set import OF_SERIES
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.scalars import units_attribute
 from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:  # figures need no JAX
@@ -59,6 +60,19 @@ def series_labels(result: Any) -> list[Any]:
 def times_of(dataset: xr.Dataset, clock: str = "time") -> xr.DataArray:
     """Return the times along the dimension ``clock`` of a group, (K,), or (B, K) where series have their own."""
     return dataset[TIMES] if TIMES in dataset.variables else dataset[clock]
+
+
+def time_coordinate(name: str, times: np.ndarray, panel: tuple[str, ...], units: Mapping[str, str]) -> dict[str, Any]:
+    """Return the coordinate of the times along a dimension.
+
+    Args:
+        name: the dimension, "time" or "at".
+        times: (K,), or (B, K) of series that have their own.
+        panel: the dimension of the series; empty for one series.
+        units: name -> unit.
+    """
+    label, dims = (name, (name,)) if np.ndim(times) == 1 else (TIMES, (*panel, name))
+    return {label: (dims, times, units_attribute(["time"], units))}
 
 
 def select_series(result: Any, series: Any) -> Any:
