@@ -101,11 +101,11 @@ def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable | SharedF
         return mapped(lambda draw, key: function(draw, key, *arguments), draws, keys, batch_size=BATCH_SIZE)
 
     if isinstance(per_draw, SharedFunction):
-        function, find = per_draw.per_draw, bound.program
+        function, compiled = per_draw.per_draw, bound.program
         arguments = bound.arguments, *per_draw.arguments
     else:
-        function, find, arguments = per_draw, bound.compiled, (bound.argument,)
-    run = find(("map draws", is_vectorized, name), lambda: jax.jit(by_fours if is_vectorized else sequential))
+        function, compiled, arguments = per_draw, bound.compiled, (bound.argument,)
+    run = compiled(("map draws", is_vectorized, name), lambda: jax.jit(by_fours if is_vectorized else sequential))
     keys = split_keys(key, count)
 
     def batch_arguments(start: int) -> tuple[dict[str, np.ndarray], jax.Array, *tuple[Any, ...]]:

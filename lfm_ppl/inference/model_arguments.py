@@ -3,12 +3,13 @@
 1. `ModelInputs` splits times, keyword arguments and time grids into arrays, which a program takes as arguments, and
    everything else, which is a part of the pytree's structure, so that `jax.jit` compiles another program for it.
 2. `ModelArguments` adds the data.
-3. `signature` compares pytrees by value.
+3. `signature` compares pytrees by value, and `variables_of` finds the variables that a model function reads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+import types
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -104,6 +105,32 @@ def signature(value: Any) -> Hashable:
     if checks.traced(leaves):
         return None
     return structure, tuple(_leaf_signature(leaf) for leaf in leaves)
+
+
+def variables_of(function: Callable) -> dict[str, Any]:
+    """Return the global and closure variables that a Python function reads, functions inside it included.
+
+    A function whose variables have changed is another model. Variables of functions that it calls are not followed, as
+    in `jax.jit`.
+    """
+    if not isinstance(function, types.FunctionType):
+        return {}
+    names = set(_global_names(function.__code__))
+    variables = {name: value for name, value in function.__globals__.items() if name in names}
+    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    for name, cell in cells:
+        try:
+            variables[name] = cell.cell_contents
+        except ValueError:  # a variable without a value so far
+            continue
+    return variables
+
+
+def _global_names(code: types.CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _global_names(constant)
 
 
 def _leaf_signature(leaf: Any) -> Hashable:

@@ -9,9 +9,7 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -20,13 +18,13 @@ import numpy as np
 
 from lfm_ppl.filtering.grid_layout import GridLayout, padded_size
 from lfm_ppl.filtering.smoother import SmootherResult
-from lfm_ppl.filtering.time_grid import LONGEST_FORECAST, build_time_grid
+from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.map_draws import BatchStore, SharedFunction, map_draws, map_series
-from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS
 from lfm_ppl.inference.model_arguments import signature
 from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.path_plan import PathPlan, first_simulated_times, has_forecast, plan_paths
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -34,7 +32,6 @@ from lfm_ppl.model.simulate import input_breakpoints, simulate_missing_states
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
-from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import semidefinite_root
 from lfm_ppl.utils.progress import Reporter
 
@@ -43,10 +40,6 @@ _FILTERS = 4
 
 _POINTS = 8
 """Points of the distribution of state and forces, for the bands of non-linear functions of them."""
-
-_ADAPTIVE_FACTOR = 5
-"""Largest number of adaptive steps, as a multiple of the number of equal steps."""
-
 
 LOG_PRIOR = "log prior of "
 """Start of the names of the log prior densities among the scores."""
@@ -118,15 +111,15 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     example = bound.site.example
     is_forecast = None
     if particles is None and not isinstance(example, ConstrainedLikelihood) and example.ssm.drift_structure.nonlinear:
-        is_forecast = _has_forecast(bound, at)
+        is_forecast = has_forecast(bound, at)
     is_shared = particles is None and bound.traced.inputs is not None
     count = None if at is None else at.shape[-1]
     if at is not None and is_shared and not is_forecast:
         # Repetitions of the last time, so that similar times share a program; their results are removed below.
         extra = padded_size(at.size + bound.times.size) - at.size - bound.times.size
         at = np.append(at, np.repeat(at[-1], extra))
-    plan = _plan(bound, at, particles is not None or is_forecast is not None,
-                 _first_simulated_times(bound) if is_forecast else np.full(bound.times.shape[:-1], -np.inf))
+    plan = plan_paths(bound, at, particles is not None or is_forecast is not None,
+                 first_simulated_times(bound) if is_forecast else np.full(bound.times.shape[:-1], -np.inf))
 
     def draw_series(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array, path_times: Any = plan.times,
                     layout: GridLayout | None = None) -> dict[str, jax.Array]:
@@ -217,7 +210,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
 
 
 def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Array,
-               plan: _Plan) -> dict[str, jax.Array]:
+               plan: PathPlan) -> dict[str, jax.Array]:
     """Return outputs, replicated data and predictions along one path (L, M + R), for an observation family."""
     size, requested, data = ssm.physical_dim, plan.requested, plan.data
     output = jax.vmap(lambda w, t: expected_observation(ssm, w, t))(w[requested], when[requested])
@@ -231,109 +224,13 @@ def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Arr
             "prediction": prediction}
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """Times of the paths.
-
-    Attributes:
-        times: (L,), requested times, times between them, and times of the data, or (B, L) where series have their own;
-            None: the times of the data.
-        requested: (K,), rows of the requested times.
-        data: (T,), rows of the data.
-        steps: steps of the simulation in each row.
-        smoother_steps: steps of the smoother between two times of a series with its own times; None: the model's.
-    """
-
-    times: np.ndarray | None
-    requested: np.ndarray
-    data: np.ndarray
-    steps: int
-    smoother_steps: int | None = None
-
-    @property
-    def is_of_series(self) -> bool:
-        """Whether each series has times of its own."""
-        return self.times is not None and self.times.ndim == 2
-
-    @property
-    def rows(self) -> int:
-        """Number of times."""
-        return len(self.data) if self.times is None else self.times.shape[-1]
-
-
-def _plan(bound: BoundModel, requested_times: np.ndarray | None, simulated: bool, since: np.ndarray) -> _Plan:
-    """Return the rows, of which rows after ``since`` are simulated, if any are.
-
-    After the data, rows are at most as far apart as the data usually are where a simulation or the known inputs of a
-    linear model are integrated.
-
-    Args:
-        bound: the model and its data.
-        requested_times: (K,), or (B, K) for each series; None: the times of the data.
-        simulated: whether paths are simulated.
-        since: time, or times (B,) where series have their own.
-    """
-    if requested_times is None or bound.times.ndim == 1:
-        return _plan_of(bound.site.example, bound.times, requested_times, simulated, float(np.min(since)))
-    requested_times = np.broadcast_to(requested_times, (len(bound.times), requested_times.shape[-1]))
-    members = bound.site.members
-    plans = [_plan_of(series, times, requested, simulated, float(start))
-             for series, times, requested, start in zip(members, bound.times, requested_times, since, strict=True)]
-    length = max(plan.rows for plan in plans)
-    count, data = requested_times.shape[1], plans[0].data.size
-    # The first requested time pads the times between requested ones, of which series have different numbers.
-    rows = [np.insert(times, count, np.repeat(times[0], length - len(times)))
-            for times in (plan.times for plan in plans) if times is not None]
-    smoother_steps = [_steps_per_interval(series.ssm, times, row, series.steps)
-                      for series, times, row in zip(members, bound.times, rows, strict=True)]
-    return _Plan(np.array(rows), plans[0].requested, np.arange(length - data, length),
-                 max(plan.steps for plan in plans), max(smoother_steps))
-
-
-def _plan_of(series: SeriesLikelihood, times: np.ndarray, requested_times: np.ndarray | None, simulated: bool,
-             since: float) -> _Plan:
-    """Return the rows of a series, or of all series with common times; arguments as in `_plan`."""
-    gaps = np.diff(times, axis=-1)
-    base = series.steps
-    if series.max_step is not None:
-        base = max(base, int(np.ceil(gaps.max(initial=0.0) / series.max_step * (1 - 1e-12))))
-    fine = SIMULATION_STEPS * base * (1 if series.tolerance is None else _ADAPTIVE_FACTOR)
-    rows = np.arange(times.shape[-1])
-    if requested_times is None:
-        return _Plan(None, rows, rows, fine)
-    beyond = np.array([])
-    needs_steps = simulated or not series.ssm.mean_invariant
-    if needs_steps and requested_times.max() > times[-1] and (gaps > 0).any():
-        gap = np.median(gaps[gaps > 0])
-        count = min(int(np.ceil((requested_times.max() - times[-1]) / gap * (1 - 1e-12))), LONGEST_FORECAST)
-        beyond = np.linspace(times[-1], requested_times.max(), count + 1)[1:-1]
-    path_times = np.concatenate([requested_times, beyond])
-    steps = _steps_per_interval(series.ssm, times, path_times, fine, since) if simulated else fine
-    first = len(path_times)
-    return _Plan(np.concatenate([path_times, times]), np.arange(len(requested_times)), first + rows, steps)
-
-
-def _has_forecast(bound: BoundModel, requested_times: np.ndarray | None) -> bool:
-    """Return whether a time of the trajectories lies after the last observation of a series."""
-    is_observed = np.isfinite(np.asarray(bound.y)).any(axis=-1)
-    if requested_times is not None and np.any(requested_times > bound.times[..., -1:]):
-        return True
-    return not bool(np.all(is_observed[..., -1]))
-
-
-def _first_simulated_times(bound: BoundModel) -> np.ndarray:
-    """Return the time of the last observation of each series."""
-    is_observed = np.isfinite(np.asarray(bound.y)).any(axis=-1)
-    return np.where(is_observed, bound.times, -np.inf).max(axis=-1)
-
-
-def _last_observed(y: jax.Array, when: jax.Array, plan: _Plan) -> jax.Array:
+def _last_observed(y: jax.Array, when: jax.Array, plan: PathPlan) -> jax.Array:
     """Return the time of the last observation, minus infinity without any, where the whole path is simulated."""
     return jnp.max(jnp.where(jnp.isfinite(y).any(axis=-1), when[plan.data], -jnp.inf))
 
 
 def _simulate_forecast(distribution: SeriesLikelihood, states: jax.Array, when: jax.Array, is_smoothed: jax.Array,
-                       plan: _Plan, key: jax.Array) -> jax.Array:
+                       plan: PathPlan, key: jax.Array) -> jax.Array:
     """Return the joint states (L, n), simulated after the last smoothed one; ``is_smoothed`` is (L,)."""
     order = jnp.arange(plan.rows) if plan.times is None else jnp.argsort(when, stable=True)
     # Breakpoints before the first time or after the last one change nothing.
@@ -346,7 +243,7 @@ def _simulate_forecast(distribution: SeriesLikelihood, states: jax.Array, when: 
 
 
 def _moments(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, is_smoothed: jax.Array,
-             plan: _Plan) -> dict[str, jax.Array]:
+             plan: PathPlan) -> dict[str, jax.Array]:
     """Return mean and sd of state and forces at the requested times: of a path (L, M + R) where it is simulated."""
     size, requested = ssm.physical_dim, plan.requested
     mean = jnp.where(is_smoothed, smoothed.input_mean, w)[requested]
@@ -357,7 +254,7 @@ def _moments(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, is_sm
 
 
 def _points(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, when: jax.Array, is_smoothed: jax.Array,
-            plan: _Plan, key: jax.Array, with_noise: bool) -> dict[str, jax.Array]:
+            plan: PathPlan, key: jax.Array, with_noise: bool) -> dict[str, jax.Array]:
     """Return non-linear functions of state and forces, (P, K, ...), at points of their normal distribution.
 
     A point has the same coordinates, in units of the distribution, at all times, so that it moves smoothly. Where a
@@ -421,26 +318,3 @@ def _particle_path(distribution: SeriesLikelihood, y: jax.Array, requested_times
     best = jax.random.categorical(choice, jnp.where(jnp.isneginf(total).all(), 0.0, total))
     when = jnp.asarray(grid.requested_times, float)
     return jax.vmap(ssm.inputs)(states[best][:, 0], when), when
-
-
-def _steps_per_interval(ssm: StateSpaceModel, times: Any, requested_times: Any, steps: int,
-                        since: float = -np.inf) -> int:
-    """Return the number of steps of rows after ``since`` with which no step is longer than between two observations."""
-    concrete_times = checks.concrete(times)
-    if requested_times is None or concrete_times is None:
-        return steps
-    grid = build_time_grid(ssm, concrete_times, 1, sys.float_info.max, requested_times)
-    if checks.traced(grid.since):  # breakpoints of a known input that are read at a lag
-        return steps
-    rows, origin = grid.intervals, np.asarray(grid.initial_time)
-    # Counted from the initial time, so that the origin of time does not matter.
-    end, first = grid.since + rows.length, since - origin
-    marks = np.unique(np.append(concrete_times - origin, 0.0))
-    if len(marks) == 1:
-        return steps
-    gaps = np.diff(marks)
-    # A row after the last observation is compared with the usual distance between two observations.
-    index = np.searchsorted(marks, end - 1e-12 * np.abs(end), side="left") - 1
-    gap = np.where(index < len(gaps), gaps[np.clip(index, 0, len(gaps) - 1)], np.median(gaps))
-    share = (rows.length / gap)[end > first].max(initial=0.0)
-    return max(1, int(np.ceil(steps * min(float(share), 1.0) - 1e-9)))

@@ -95,11 +95,12 @@ class SeriesLikelihood(dist.Distribution):
     def _laid_out(self) -> tuple[GridLayout, list[InputRead], EventTable]:
         return lay_out_time_grid(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
 
-    def lay_out(self, at: Any = None) -> GridLayout:
+    def lay_out(self, requested_times: Any = None) -> GridLayout:
         """Return the layout of the time grid with requested times (K,); None: the times of the data."""
-        if at is None:
+        if requested_times is None:
             return self._laid_out[0]
-        return lay_out_time_grid(self.ssm, self.times, self.steps, self.max_step, at, tolerance=self.tolerance)[0]
+        return lay_out_time_grid(self.ssm, self.times, self.steps, self.max_step, requested_times,
+                                 tolerance=self.tolerance)[0]
 
     def grid_of(self, layout: GridLayout) -> TimeGrid:
         """Return the time grid of a layout of this likelihood, for its parameters."""

@@ -19,9 +19,8 @@ from __future__ import annotations
 
 import functools
 import re
-import types
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any
 
 import jax
@@ -44,7 +43,7 @@ from lfm_ppl.inference.likelihood_site import (
     single_site,
 )
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.inference.model_arguments import ModelArguments, ModelInputs, shapes, signature
+from lfm_ppl.inference.model_arguments import ModelArguments, ModelInputs, shapes, signature, variables_of
 from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, latent_sites
 from lfm_ppl.utils import checks
 
@@ -172,11 +171,12 @@ class TracedModel:
         transformation(run, *arguments)
         return results
 
-    def lay_out(self, site: str, at: np.ndarray) -> ModelInputs:
+    def lay_out(self, site: str, requested_times: np.ndarray) -> ModelInputs:
         """Return the layout of a site with requested times (K,), an argument of `programs`."""
         # Other sites may have later initial times, or known inputs that end before the requested times.
-        recorded = self._recorded(lambda likelihood: likelihood.lay_out(at), self.with_times(self._example),
-                                  jax.eval_shape, jnp.zeros(self.size), shapes(self._example), only_site=site)
+        recorded = self._recorded(
+            lambda likelihood: likelihood.lay_out(requested_times), self.with_times(self._example), jax.eval_shape,
+            jnp.zeros(self.size), shapes(self._example), only_site=site)
         return ModelInputs.of((), recorded[site].padded())
 
     def share_programs(self, identity: Hashable) -> TracedModel:
@@ -342,7 +342,7 @@ def traced_model(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
     data = None if data_index is None else jax.tree.map(lambda leaf: jnp.asarray(checks.unmask(leaf)), arguments[-1])
     static = arguments if data_index is None else (*arguments[:-1], None)
     key = signature((static, dict(keywords), jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), data)))
-    variables = _variables(model)
+    variables = variables_of(model)
     # Whatever is built from tracers must not be reused after their trace has ended.
     is_cached = key is not None and not checks.traced(data) and not checks.traced(jax.tree.leaves(variables))
     key = (model, key, signature(variables))
@@ -363,32 +363,6 @@ def traced_model(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
         if len(_models) > _CACHED_MODELS:
             _models.popitem(last=False)
     return traced, data
-
-
-def _variables(function: Callable) -> dict[str, Any]:
-    """Return the global and closure variables that a Python function reads, functions inside it included.
-
-    A function whose variables have changed is another model. Variables of functions that it calls are not followed, as
-    in `jax.jit`.
-    """
-    if not isinstance(function, types.FunctionType):
-        return {}
-    names = set(_global_names(function.__code__))
-    variables = {name: value for name, value in function.__globals__.items() if name in names}
-    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-    for name, cell in cells:
-        try:
-            variables[name] = cell.cell_contents
-        except ValueError:  # a variable without a value so far
-            continue
-    return variables
-
-
-def _global_names(code: types.CodeType) -> Iterator[str]:
-    yield from code.co_names
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            yield from _global_names(constant)
 
 
 def _unconstrained(sites: Mapping[str, Any]) -> dict[str, jax.Array]:

@@ -123,7 +123,7 @@ def bind_sites(numpyro_model: Callable, sites: Mapping[str, Any], model_kwargs: 
                              "or numbers for all.")
         return _bind_sites(numpyro_model, sites, model_kwargs), sites, (None, "")
     unit = next(iter(sites.values())).units["time"]
-    origin = origins[int(np.argmin([calendar_time.positions("times", other, origins[0], unit) for other in origins]))]
+    origin = origins[int(np.argmin([calendar_time.positions("times", date, origins[0], unit) for date in origins]))]
 
     def bind_in(unit: str) -> tuple[BoundModel, dict[str, Any], tuple[str | None, str]]:
         on_clock: dict[str, Any] = {name: at_origin(value, origin, unit) for name, value in sites.items()}

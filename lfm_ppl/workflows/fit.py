@@ -236,8 +236,8 @@ def fit(
         raise ValueError("resume continues a run that is stored in a folder; name the folder, checkpoint=...")
     if checkpoint is not None:
         checkpoints.check_folder(checkpoint, resume, overwrite)
-    passed = data_by_site(times, y)
-    if passed is None:
+    site_data = data_by_site(times, y)
+    if site_data is None:
         table = as_data(times) if y is None else None
         pair = (times, y) if table is None else (table.times, table.y)
         bound, data, clock = bind_dates(numpyro_model, pair[0], pair[1], table, model_kwargs)
@@ -247,12 +247,12 @@ def fit(
         sites = {bound.site.name: _site_problem(bound, value, data, clock, at, truth, dims, coords)}
     elif sampler == "pmmh":
         raise ValueError("sampler 'pmmh' takes a model with one likelihood site, and there are data of "
-                         f"{', '.join(passed)}; take 'nuts' or 'ram'.")
+                         f"{', '.join(site_data)}; take 'nuts' or 'ram'.")
     else:
-        bound, on_clock, clock = bind_sites(numpyro_model, passed, model_kwargs)
+        bound, on_clock, clock = bind_sites(numpyro_model, site_data, model_kwargs)
         sites = {name: _site_problem(bound.site_models[name], value, on_clock[name], clock,
-                                     of_site("at", at, name, passed), of_site("truth", truth, name, passed), dims,
-                                     coords_of_site(coords, name, passed)) for name, value in passed.items()}
+                                     of_site("at", at, name, site_data), of_site("truth", truth, name, site_data), dims,
+                                     coords_of_site(coords, name, site_data)) for name, value in site_data.items()}
     digest = None if checkpoint is None else model_digest(bound)
     bound = bound.fix(fixed)
     sites = {name: replace(sites[name], bound=site_model, description={
@@ -307,11 +307,11 @@ def fit(
     return result
 
 
-def _site_problem(bound: BoundModel, passed: Data | tuple, data: Any, clock: tuple[str | None, str], at: Any,
+def _site_problem(bound: BoundModel, site_data: Data | tuple, data: Any, clock: tuple[str | None, str], at: Any,
                   truth: Mapping[str, Any] | None, dims: Mapping[str, Sequence[str]] | None,
                   coords: Mapping[str, Sequence[Any]] | None) -> SiteProblem:
-    """Check the arguments of `fit` on one likelihood site; ``passed`` are its data, and ``data`` these on the clock."""
-    unit = passed.units.get("time") if isinstance(passed, Data) else None
+    """Check the arguments of `fit` on one likelihood site; ``data`` are ``site_data`` with times on the clock."""
+    unit = site_data.units.get("time") if isinstance(site_data, Data) else None
     data = data if isinstance(data, Data) else None
     if clock[0] is None and unit:  # numbers are not converted to a common unit
         clock = None, unit
@@ -325,7 +325,7 @@ def _site_problem(bound: BoundModel, passed: Data | tuple, data: Any, clock: tup
         warn_of_missing_predictions(bound, at)
     if data is not None:
         coords = {"output": data.outputs, **({SERIES: data.series} if data.series else {}), **(coords or {})}
-    labels = Labels.of(bound, dims, coords, None if isinstance(passed, Data) else passed[1])
+    labels = Labels.of(bound, dims, coords, None if isinstance(site_data, Data) else site_data[1])
     truth = data.truth if truth is None and data is not None else truth
     return SiteProblem(bound, labels, at, data, clock, checked_truth(bound, truth, labels))
 
