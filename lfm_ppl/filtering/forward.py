@@ -39,6 +39,7 @@ from lfm_ppl.filtering.problem import FilterProblem, has_exact_transitions
 from lfm_ppl.filtering.update import (
     INNOVATION_FACTOR,
     UPDATE_FAILED,
+    RowUpdate,
     Update,
     Updater,
     linearize_observation,
@@ -126,7 +127,7 @@ def forward(problem: FilterProblem, updater: Updater, *, initial: Moments | None
         record: recorded output.
         maps: affine maps of the intervals, where they are known; of ``about`` only the ``end_moments`` are used then.
     """
-    ssm, rule, grid, shared = problem
+    ssm, rule, grid, _ = problem
     start = problem.initial(initial)
     update = updater.bind(problem, start)
     has_map = record is Record.SMOOTHER or (record is Record.LINEARIZATION and grid.tolerance is not None)
@@ -139,12 +140,8 @@ def forward(problem: FilterProblem, updater: Updater, *, initial: Moments | None
         else:
             prediction = predict_by_map(moments, interval_map.phi, interval_map.process_cov, interval_map.point,
                                         interval_map.mean)
-        centre = prediction.moments if points is None or points.end_moments is None else points.end_moments
-        index = jnp.maximum(interval.observation, 0)
-        observation = linearize_observation(ssm, rule, shared.observation_jacobian, interval.end, index, centre)
-        if centre is not prediction.moments:
-            observation = observation.shifted(prediction.moments.mean - centre.mean)
-        updated = update(observation, index, row, prediction.moments)
+        centre = None if points is None else points.end_moments
+        updated = update_at_end(problem, update, interval, row, prediction.moments, centre)
         terms = updated.site_terms
         trace = FilterTrace(None, updated.log_likelihood, predictor=None if terms is None else terms.value)
         if record is not Record.LIKELIHOOD:
@@ -160,6 +157,27 @@ def forward(problem: FilterProblem, updater: Updater, *, initial: Moments | None
     inputs = as_arrays(grid.intervals), rows, about, maps
     trace = jax.lax.scan(jax.checkpoint(step, prevent_cse=False, policy=_STORED), start, inputs)[1]
     return trace._replace(initial=start)
+
+
+def update_at_end(problem: FilterProblem, update: RowUpdate, interval: Intervals, row: Any, predicted: Moments,
+                  centre: Moments | None = None) -> Update:
+    """Update predicted moments by the observation at the end of an interval.
+
+    Args:
+        problem: the model, the rule and the time grid.
+        update: of a row, from `Updater.bind`.
+        interval: one interval.
+        row: its data.
+        predicted: moments at its end.
+        centre: moments about which the observation is linearised; None: the predicted ones.
+    """
+    ssm, rule, _, shared = problem
+    index = jnp.maximum(interval.observation, 0)
+    observation = linearize_observation(ssm, rule, shared.observation_jacobian, interval.end, index,
+                                        predicted if centre is None else centre)
+    if centre is not None:
+        observation = observation.shifted(predicted.mean - centre.mean)
+    return update(observation, index, row, predicted)
 
 
 def _recorded_update(update: Update, record: Record) -> Update:
