@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -87,14 +87,7 @@ def build_models(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ..
     if not isinstance(rule, SwitchingRule):
         raise TypeError(f"rule must be an lfm.SwitchingRule such as lfm.Thermostat(20.0), got {type(rule).__name__}.")
     ssms = tuple(state_space(build(value)) for value in rule.values)
-    if any(ssm.model.events for ssm in ssms):
-        raise ValueError("a switched model does not support events; leave out the events of build(value).")
-    structures = [(ssm.model.state_names, ssm.model.force_names, ssm.model.output_names, ssm.state_dim,
-                   ssm.stack.jump_times) for ssm in ssms]
-    for value, structure in zip(rule.values, structures, strict=True):
-        if structure != structures[0]:
-            raise ValueError(f"build({value:g}) has other states, outputs or jump times than build({rule.values[0]:g});"
-                             " the discrete input may change coefficients only.")
+    check_structure({f"build({value:g})": ssm for value, ssm in zip(rule.values, ssms, strict=True)})
     starts = [[checks.concrete(entry) for entry in (*ssm.initial(), ssm.model.initial_time)] for ssm in ssms]
     for value, start in zip(rule.values, starts, strict=True):
         pairs = zip(start, starts[0], strict=True)
@@ -102,6 +95,19 @@ def build_models(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ..
             raise ValueError(f"build({value:g}) has another initial state or time than build({rule.values[0]:g}); the "
                              "input acts from the initial time on, so both models must start alike.")
     return ssms
+
+
+def check_structure(ssms: Mapping[str, StateSpaceModel]) -> None:
+    """Raise ValueError unless the models, by their names in messages, differ in coefficients only."""
+    first, *_ = names = list(ssms)
+    structures = [(ssm.model.state_names, ssm.model.force_names, ssm.model.output_names, ssm.model.deterministic_names,
+                   ssm.model.observation.angular, ssm.state_dim, ssm.stack.jump_times) for ssm in ssms.values()]
+    for name, structure in zip(names, structures, strict=True):
+        if ssms[name].model.events:
+            raise ValueError(f"{name} has events, which a model that switches does not support; leave them out.")
+        if structure != structures[0]:
+            raise ValueError(f"{name} has other states, forces, outputs, deterministics or jump times than {first}; "
+                             "models between which the system switches may differ in coefficients only.")
 
 
 def decision_grid(ssm: StateSpaceModel, times: Any, decisions: Any, start: FilterState | None, steps: int,

@@ -97,8 +97,25 @@ def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: 
 def _simulate(problem: SwitchedProblem, schemes: tuple[str, ...], times: jax.Array,
               key: jax.Array) -> SwitchedSimulation:
     """Simulate all paths; ``schemes`` are the integration schemes of the models."""
+    ssm, values = problem.ssms[0], jnp.asarray(problem.rule.values)
+    w, y, _, next_indices = simulate_paths(problem, schemes, times, key)
+    size = ssm.physical_dim
+    forces = {name: w[:, :, size + number] for number, name in enumerate(ssm.model.force_names)}
+    return SwitchedSimulation(times, w[:, :, :size], forces, values[next_indices], y)
+
+
+def simulate_paths(problem: SwitchedProblem, schemes: tuple[str, ...], times: jax.Array,
+                   key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Simulate all paths: inputs (T, N, M + R), observations (T, N, D), indices (T, N) before and after the decisions.
+
+    Args:
+        problem: models, rule, time grid and initial values.
+        schemes: integration schemes of the models.
+        times: (T,), times of the observations.
+        key: a JAX random key.
+    """
     ssms, rule, grid = problem.ssms, problem.rule, problem.grid
-    paths, size = problem.initial_index.shape[0], ssms[0].physical_dim
+    paths = problem.initial_index.shape[0]
     initial_key, rows_key, noise_key = jax.random.split(key, 3)
     initial_state = initial_particles(initial_key, problem.start.mean, problem.start.covariance, paths)
     reading_root = semidefinite_root(jnp.diag(rule.variance()))
@@ -137,5 +154,4 @@ def _simulate(problem: SwitchedProblem, schemes: tuple[str, ...], times: jax.Arr
     # Observations precede the decision at the same time, and depend on the input before it.
     w, y = jax.vmap(jax.vmap(observe, (1, None, 0, 0, None)))(states, times, observed_indices, keys,
                                                              jnp.arange(times.shape[0]))
-    forces = {name: w[:, :, size + number] for number, name in enumerate(ssms[0].model.force_names)}
-    return SwitchedSimulation(times, w[:, :, :size], forces, jnp.asarray(rule.values)[next_indices], y)
+    return w, y, observed_indices, next_indices
