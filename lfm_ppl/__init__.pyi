@@ -31,6 +31,7 @@ from .inference.kernels.ram import RAM as RAM
 from .inference.map import map_estimate as map_estimate
 from .inference.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
 from .inference.panel import panel as panel
+from .inference.switching import Switching as Switching
 from .io import data as data
 from .io.data import read_csv as read_csv
 from .io.data import read_table as read_table

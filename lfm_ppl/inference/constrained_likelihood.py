@@ -103,6 +103,11 @@ class ConstrainedLikelihood(SeriesLikelihood):
                                                        "draws")}
 
     @property
+    def has_gaussian_state(self) -> bool:
+        """Whether the state given data and parameters is Gaussian: not under constraints."""
+        return False
+
+    @property
     def has_sites(self) -> bool:
         """Whether Gaussian sites approximate factors of the density."""
         return True
@@ -158,13 +163,13 @@ class ConstrainedLikelihood(SeriesLikelihood):
 
         def draw(key: jax.Array) -> jax.Array:
             path_key, noise_key = jax.random.split(key)
-            w, times = self.feasible_path(path_key, jnp.full(self.event_shape, jnp.nan))
+            w, times = self.sample_path(path_key, jnp.full(self.event_shape, jnp.nan))
             return jax.vmap(lambda w, t, key, row: noisy_observation(self.ssm, w, t, key, row))(
                 w, times, jax.random.split(noise_key, len(times)), jnp.arange(len(times)))
 
         return repeat_draw(draw, key, sample_shape)
 
-    def feasible_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
+    def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
         """Draw a trajectory under the constraints, chosen by its weight among 64.
 
         Args:

@@ -17,6 +17,7 @@ from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.inference.switching import Switching
 from lfm_ppl.model.observations.family import ObservationFamily
 
 _TIMES = 16
@@ -125,6 +126,8 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
             boxes = distribution.truncated_posterior().boxes
             self.values.append(boxes(*ssm.split(w), self.times[0]))
             self.settings += repr((boxes.constraints.labels, distribution.grid, distribution.draws))
+        elif isinstance(distribution, Switching):
+            self.settings += repr((distribution.regime_names, distribution.max_step, distribution.merging))
         else:
             self.settings += repr((distribution.max_step, distribution.iterations, distribution.damping,
                                    distribution.tolerance, distribution.method, distribution.sites))

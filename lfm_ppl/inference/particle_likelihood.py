@@ -93,7 +93,7 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         'ParticleLikelihood'
     """
 
-    supports_constraints = False
+    supports_all_likelihoods = False
 
     def __init__(self, fn: Callable[..., Any] | None, key: jax.Array, settings: ParticleSettings,
                  steps: int | None = None) -> None:

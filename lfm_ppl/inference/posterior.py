@@ -20,7 +20,6 @@ from lfm_ppl.filtering.grid_layout import GridLayout, padded_size
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.map_draws import BatchStore, SharedFunction, map_draws, map_series
 from lfm_ppl.inference.model_arguments import signature
 from lfm_ppl.inference.panel import Panel
@@ -110,7 +109,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         at = None
     example = bound.site.example
     is_forecast = None
-    if particles is None and not isinstance(example, ConstrainedLikelihood) and example.ssm.drift_structure.nonlinear:
+    if particles is None and example.has_gaussian_state and example.ssm.drift_structure.nonlinear:
         is_forecast = has_forecast(bound, at)
     is_shared = particles is None and bound.traced.inputs is not None
     count = None if at is None else at.shape[-1]
@@ -126,9 +125,9 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         ssm = distribution.ssm
         path_key, noise_key = jax.random.split(key)
         results: dict[str, jax.Array] = {}
-        if isinstance(distribution, ConstrainedLikelihood):
+        if particles is None and not distribution.has_gaussian_state:
             smoothed = None
-            w, when = distribution.feasible_path(path_key, y, path_times)
+            w, when = distribution.sample_path(path_key, y, path_times)
         elif particles is None:
             reached = layout or path_times
             if layout is None and is_forecast and path_times is not None:

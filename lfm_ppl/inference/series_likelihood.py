@@ -2,7 +2,7 @@
 
 1. The latent force model becomes a state-space model, its times a time grid (both computed when first used).
 2. `filter` and `smooth` run on that grid with the settings of the distribution.
-3. Subclasses define the log density and its samples: `MarginalLikelihood` and `ConstrainedLikelihood`.
+3. Subclasses define the log density and its samples: `MarginalLikelihood`, `ConstrainedLikelihood` and `Switching`.
 """
 
 from __future__ import annotations
@@ -124,6 +124,16 @@ class SeriesLikelihood(dist.Distribution):
         return isinstance(self.model.observation, ObservationFamily)
 
     @property
+    def ssms(self) -> tuple[StateSpaceModel, ...]:
+        """The state-space models of all regimes; one but for a likelihood with several."""
+        return (self.ssm,)
+
+    @property
+    def has_gaussian_state(self) -> bool:
+        """Whether the state given data and parameters is Gaussian; if not, there is a method `sample_path`."""
+        return True
+
+    @property
     def has_sites(self) -> bool:
         """Whether Gaussian sites approximate factors of the density."""
         return self.is_family
@@ -214,6 +224,10 @@ class SeriesLikelihood(dist.Distribution):
         log_likelihood = finite_or_minus_infinity(self._one_step_ahead, y)
         warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood, None, True)
         return log_likelihood
+
+    def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
+        """Draw a path of a state that is not Gaussian: (x, u) (L, M + R), and its times (L,)."""
+        raise NotImplementedError
 
     def leave_one_out(self, y: jax.Array, smoothed: SmootherResult) -> jax.Array:
         """Return (T,), log p(y_k | y_-k), given the result of `smooth`."""

@@ -79,6 +79,8 @@ def _likelihood_failure(bound: BoundModel, z: Any) -> str | None:
 def _series_failure(member: SeriesLikelihood, y: Any) -> str:
     if isinstance(member, ConstrainedLikelihood):
         return "the likelihood under constraints is not finite: they may be impossible together with the data."
+    if not member.has_gaussian_state:
+        return "the filter of all regimes breaks down; smooth the data with the model of each regime to see where."
     if member.is_family:
         return family_breakdown(member.ssm, member.rule, member.time_grid, y, member.site_settings)
     return breakdown(member.ssm, member.rule, member.time_grid, y) or (

@@ -63,7 +63,7 @@ class GaussianObservation(eqx.Module):
         """Whether the covariance is a function of (x, u, t)."""
         return callable(self.covariance)
 
-    def covariance_at(self, x: jax.Array, u: jax.Array, t: jax.Array, row: jax.Array) -> jax.Array:
+    def covariance_at(self, x: jax.Array, u: jax.Array, t: jax.Array, row: Any) -> jax.Array:
         """Return R (D, D) at a state, a time and a row of the observations."""
         value = self.covariance(x, u, t) if callable(self.covariance) else self.covariance
         value = jnp.atleast_1d(jnp.asarray(value, float))

@@ -116,6 +116,9 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         if example.constraints_in_words:
             raise ValueError("a check of the Gaussian filter's accuracy does not support constraints, and the "
                              f"likelihood has some: {example.constraints_in_words}. Leave them out.")
+        if not example.has_gaussian_state:
+            raise ValueError("a check of the Gaussian filter's accuracy does not support a model that switches between "
+                             "regimes; compare its likelihood with lfm.rao_blackwellised.")
     kinds = {name: _kind(reference, example.ssm) for name, example in examples.items()}
     posterior = arviz_data.group(result, "posterior")
     draw_index, rows = evenly_spaced(posterior.sizes["chain"], posterior.sizes["draw"], draws)

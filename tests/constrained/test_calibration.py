@@ -55,7 +55,7 @@ def test_data_are_simulated_from_the_constrained_prior():
     """Calibration rests on it: the force of the records is the prior's given that it is nowhere negative."""
     count = 4000
     paths, y = jax.jit(jax.vmap(lambda key: (
-        bounded(0.6, 1.0).feasible_path(key, jnp.full((6, 2), jnp.nan))[0], bounded(0.6, 1.0).sample(key))))(
+        bounded(0.6, 1.0).sample_path(key, jnp.full((6, 2), jnp.nan))[0], bounded(0.6, 1.0).sample(key))))(
             jax.random.split(jax.random.key(0), count))
     exact = accepted(0.6, 1.0, 100_000)
     noisy = exact[:, :, :2] + NOISE_SD * np.random.default_rng(1).normal(size=exact[:, :, :2].shape)
@@ -85,7 +85,7 @@ def test_bands_cover_forces_of_the_constrained_prior():
     @jax.jit
     def covered(key):
         keys = jax.random.split(key)
-        path, _ = bounded(0.6, 1.0).feasible_path(keys[0], jnp.full((6, 2), jnp.nan))
+        path, _ = bounded(0.6, 1.0).sample_path(keys[0], jnp.full((6, 2), jnp.nan))
         y = path[:, :2] + NOISE_SD * jax.random.normal(keys[1], (6, 2))
         low, high = lfm.constrained_posterior(genes(0.6, 1.0), TIMES, y, lower={"factor": 0.0},
                                               grid=TIMES).interval("factor")

@@ -8,7 +8,6 @@ from typing import Any
 import numpyro.distributions as dist
 from numpyro.primitives import Messenger
 
-from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 
@@ -46,7 +45,7 @@ class LikelihoodHandler(Handler):
         only_site: name of the site whose likelihood is replaced; None: of all sites.
     """
 
-    supports_constraints = True
+    supports_all_likelihoods = True
     only_site: str | None = None
 
     def __init__(self, fn: Callable[..., Any] | None = None) -> None:
@@ -76,7 +75,7 @@ class LikelihoodHandler(Handler):
         is_selected = self.only_site is None or self.only_site == msg.get("name")
         if msg["type"] == "sample" and is_selected and isinstance(fn, (SeriesLikelihood, Panel)):
             series = fn.first if isinstance(fn, Panel) else fn
-            if isinstance(series, ConstrainedLikelihood) and not self.supports_constraints:
+            if not (series.has_gaussian_state or self.supports_all_likelihoods):
                 return
             self.has_site = True
             msg["fn"] = self.replacement(fn, msg)

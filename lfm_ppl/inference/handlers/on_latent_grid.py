@@ -77,7 +77,7 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         (1, 21)
     """
 
-    supports_constraints = False
+    supports_all_likelihoods = False
 
     def __init__(self, fn: Callable[..., Any] | None = None, points: ArrayLike = 363, rule: str = "linear") -> None:
         checks.one_of("rule", rule, RULES)

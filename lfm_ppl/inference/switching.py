@@ -1,0 +1,265 @@
+"""The marginal likelihood of a model that switches between regimes, as one NumPyro distribution.
+
+1. `regimes` builds the filter problem of each regime on a common time grid, and the transition probabilities.
+2. `log_prob` runs the filter of all regimes, in which the states are merged by their moments (`switching.regimes`).
+3. `smooth` gives probabilities of the regimes and leave-one-out densities, as averages over draws.
+4. `sample_path` draws states and regimes given the data; `lfm_ppl.fit` stores such paths.
+5. `sample` simulates the real model by `switching.switched_simulation`, with the chain as its rule.
+
+Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8); Carter and Kohn
+(1994), Biometrika 81(3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lfm_ppl.filtering.intervals import TimeGrid
+from lfm_ppl.filtering.moments import Moments
+from lfm_ppl.filtering.problem import filter_problem
+from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.resolution import check_resolution
+from lfm_ppl.model.state_space import StateSpaceModel, state_space
+from lfm_ppl.particles.stochastic_steps import choose_scheme
+from lfm_ppl.switching.chain import MarkovChain, check_probabilities, check_rates, transition_matrices
+from lfm_ppl.switching.regime_model import check_models, joint_model
+from lfm_ppl.switching.regimes import (
+    GPB2,
+    MERGINGS,
+    RegimeProblem,
+    filter_regimes,
+    sample_regimes,
+    transition_probabilities,
+)
+from lfm_ppl.switching.switched_model import SwitchedProblem
+from lfm_ppl.switching.switched_simulation import simulate_paths
+from lfm_ppl.utils import checks
+from lfm_ppl.utils.gradients import finite_or_minus_infinity
+
+SIMULATION_STEPS = 5
+"""Steps of the simulator for one integration step of the filter."""
+
+SMOOTHER_DRAWS = 256
+"""Draws over which the smoother averages; they have the same random numbers in each call."""
+
+
+class RegimeSmootherResult(eqx.Module):
+    """Result of `Switching.smooth`.
+
+    Attributes:
+        times: (K,), requested times.
+        probability: (K, R), of the R regimes given all observations.
+        mean, covariance: (K, n), (K, n, n), of the joint state of mechanism and forces, merged over the regimes.
+        log_likelihood: (T,), log p(y_k | y_1:k-1).
+        leave_one_out: (T,), log p(y_k | y_-k).
+        whitened_innovation: (T, D), normal quantiles of the predictive distribution functions, NaN where missing.
+        regimes: names of the regimes.
+    """
+
+    times: jax.Array
+    probability: jax.Array
+    mean: jax.Array
+    covariance: jax.Array
+    log_likelihood: jax.Array
+    leave_one_out: jax.Array
+    whitened_innovation: jax.Array
+    regimes: tuple[str, ...] = eqx.field(static=True)
+
+
+class Switching(SeriesLikelihood):
+    """Distribution of observations of a system that switches between regimes by a Markov chain.
+
+    Regime r(t) is a Markov chain in continuous time; in regime r the system is the latent force model of r,
+
+        p(r(t + dt) = j | r(t) = i) = exp(rates dt)_ij,    dx = f_r(x, u, t) dt + ...,    y_k ~ N(h_r(x, u, t_k), R_r).
+
+    The regime is that of the next observation between two observations. The K regimes share one scan; states that come
+    from different regimes are merged by their mean and covariance. The density is exact where the merged states have
+    equal moments, and where a regime begins with a state that does not depend on the past.
+
+    Args:
+        models: name of a regime -> its `LatentForceModel`. All have the same states, forces and outputs by name, linear
+            observations or not, and Gaussian noise.
+        rates: (K, K), rates of the transitions from regime i (row) to regime j, in 1/(unit of time), in the order of
+            ``models``; zero on the diagonal, or with rows that sum to zero. They may be sampled.
+        times: (T,), non-decreasing.
+        rule: linearisation rule; `Cubature()` by default.
+        steps: integration steps between two consecutive times; a linear time-invariant model is exact with any number.
+        max_step: longest step, in units of time; longer intervals get more steps.
+        initial: (K,), probabilities of the regimes at the initial time; None: equal ones.
+        merging: "gpb2", K^2 filters a row, or "imm", K filters, which is faster and merges earlier.
+
+    Raises:
+        ValueError, TypeError: models of other states or outputs; rates or probabilities that are none; and as
+            `lfm_ppl.filter`. In compiled code a failure is a log density of -inf.
+
+    Example:
+        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> def build(scale):
+        ...     return lfm.LatentForceModel(
+        ...         lambda x, u, t: u - x, {"u": lfm.Matern(scale, 1.0)},
+        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        >>> switching = Switching({"calm": build(0.1), "rough": build(2.0)}, [[0.0, 0.2], [0.5, 0.0]], jnp.arange(5.0))
+        >>> result = switching.smooth(jnp.array([[0.0], [0.1], [2.0], [-1.0], [0.0]]))
+        >>> result.regimes, result.probability.shape
+        (('calm', 'rough'), (5, 2))
+
+    Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8), for IMM; Tugnait (1982),
+    Automatica 18(5), for GPB2; Carter and Kohn (1994), Biometrika 81(3), for the draws.
+    """
+
+    pytree_data_fields = ("models", "rates", "initial")
+    pytree_aux_fields = ("regime_names", "merging", "max_step")
+
+    def __init__(self, models: Mapping[str, LatentForceModel], rates: ArrayLike, times: ArrayLike,
+                 rule: Rule | None = None, steps: int = 10, max_step: float | None = None, *,
+                 initial: ArrayLike | None = None, merging: str = GPB2) -> None:
+        checks.one_of("merging", merging, MERGINGS)
+        by_name = check_models(models)
+        count = len(by_name)
+        self.models, self.regime_names = tuple(by_name.values()), tuple(by_name)
+        self.rates = check_rates(rates, count)
+        self.initial = check_probabilities(jnp.full(count, 1.0 / count) if initial is None else initial, count)
+        self.merging, self.max_step = merging, max_step
+        super().__init__(joint_model(by_name, self.initial), times, rule, steps)
+
+    @property
+    def has_gaussian_state(self) -> bool:
+        """Whether the state given data and parameters is Gaussian, so that one filter describes it."""
+        return False
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Arguments besides models, rates and times."""
+        return {name: getattr(self, name) for name in ("rule", "steps", "max_step", "initial", "merging")}
+
+    def with_settings(self, **settings: Any) -> Switching:
+        """Return the same distribution with another ``rule``, ``steps`` or ``max_step``."""
+        known = ("rule", "steps", "max_step")
+        for name in settings:
+            if name not in known:
+                raise ValueError(f"{name} is not a setting of lfm.Switching, whose settings are {', '.join(known)}.")
+        models = dict(zip(self.regime_names, self.models, strict=True))
+        return Switching(models, self.rates, self.times, **{**self.settings, **settings})
+
+    @property
+    def description(self) -> str:
+        """How the likelihood is computed."""
+        return f"approximate (states of {len(self.models)} regimes merged by their moments, {self.merging})"
+
+    @property
+    def ssms(self) -> tuple[StateSpaceModel, ...]:
+        """The state-space models of the regimes."""
+        return tuple(state_space(model) for model in self.models)
+
+    def regimes(self, grid: TimeGrid | None = None) -> RegimeProblem:
+        """Return the filter problems of the regimes and the chain on a time grid; None: that of the data."""
+        grid = self.time_grid if grid is None else grid
+        problems = tuple(filter_problem(ssm, self.rule, grid) for ssm in self.ssms)
+        return RegimeProblem(problems, self.initial, transition_probabilities(self.rates, grid), self.merging)
+
+    def log_prob(self, value: Any) -> jax.Array:
+        """Return the log density of ``value`` (T, D), NaN where missing; batch dimensions may lead."""
+        value = jnp.asarray(checks.unmask(value), float)
+        if value.ndim > 2:
+            return jax.vmap(self.log_prob)(value)
+        for model in self.models:
+            check_resolution(model, self.times, value)
+        return finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), self.checked(value))
+
+    def log_prob_per_observation(self, value: Any) -> jax.Array:
+        """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation."""
+        return finite_or_minus_infinity(self._one_step_ahead, self.checked(value))
+
+    def _one_step_ahead(self, y: jax.Array) -> jax.Array:
+        return filter_regimes(self.regimes(), y).log_likelihood[jnp.asarray(self.time_grid.observed)]
+
+    def convergence(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return whether sites converge, of which there are none, and whether the log density is finite."""
+        return jnp.asarray(True), jnp.isfinite(self._one_step_ahead(y).sum())
+
+    def filter(self, y: Any) -> Any:
+        """Raise ValueError: the moments of one filter do not describe the state."""
+        raise ValueError("a model that switches between regimes has no single filter; use smooth, whose result has "
+                         "the probabilities of the regimes.")
+
+    def smooth(self, y: Any, at: Any = None, steps: int | None = None) -> Any:
+        """Smooth: the probabilities of the regimes, and the state, given all observations.
+
+        They are averages over 256 draws of later states, with an error of some 0.01.
+
+        Args:
+            y: (T, D), NaN where missing.
+            at: (K,) requested times; None: the times of the data.
+            steps: integration steps between two consecutive times; None: those of the distribution.
+        """
+        y = self.checked(y)
+        grid = self.time_grid if at is None and steps is None else self._grid(at, steps)
+        regimes, observed = self.regimes(grid), jnp.asarray(grid.observed)
+        trace = filter_regimes(regimes, y)
+        paths = sample_regimes(jax.random.key(0), regimes, trace, y, SMOOTHER_DRAWS)
+        requested = jnp.asarray(grid.requested)
+        return RegimeSmootherResult(
+            jnp.asarray(grid.requested_times, float), paths.probability[requested],
+            paths.moments.mean[requested], paths.moments.covariance[requested], trace.log_likelihood[observed],
+            paths.leave_one_out[observed], trace.residual[observed], self.regime_names)
+
+    def _grid(self, at: Any, steps: int | None = None) -> TimeGrid:
+        return build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at)
+
+    def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
+        """Draw a trajectory of state, regime and forces given the data.
+
+        Args:
+            key: a JAX random key.
+            y: (T, D), NaN where missing.
+            at: (L,) times; None: the times of the data.
+
+        Returns:
+            (x, indicators of the regimes, u) (L, M + K + R), and the times (L,).
+        """
+        grid = self.time_grid if at is None else self._grid(at)
+        regimes = self.regimes(grid)
+        paths = sample_regimes(key, regimes, filter_regimes(regimes, y), y, 1)
+        requested, times = jnp.asarray(grid.requested), jnp.asarray(grid.requested_times, float)
+        states, indices = paths.state[requested, 0], paths.regime[requested, 0]
+        candidates = jnp.stack([jax.vmap(ssm.inputs)(states, times) for ssm in self.ssms])
+        return self._with_indicators(candidates[indices, jnp.arange(len(times))], indices), times
+
+    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+        """Simulate the real model: (*sample_shape, T, D)."""
+        return repeat_draw(lambda key: self.simulate(key)[1], key, sample_shape)
+
+    def simulate(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Simulate the real model: (x, indicators of the regimes, u) (T, M + K + R), and observations (T, D)."""
+        ssms, times = self.ssms, np.asarray(self.times, float)
+        initial_key, path_key = jax.random.split(key)
+        grid = self._grid(None, SIMULATION_STEPS * self.steps)
+        distinct = np.unique(times)
+        # The decision at the last time has no consequences.
+        lengths = jnp.diff(distinct, prepend=grid.initial_time, append=distinct[-1])
+        transitions = transition_matrices(self.rates, lengths)
+        index = jax.random.categorical(initial_key, jnp.log(self.initial @ transitions[0]))
+        chain = MarkovChain(distinct, transitions[1:])
+        starts = jax.tree.map(lambda *leaves: jnp.stack(leaves)[index], *(Moments(*ssm.initial()) for ssm in ssms))
+        is_decision = np.zeros(len(np.asarray(grid.intervals.observation)), bool)
+        is_decision[np.asarray(grid.observed)[np.append(np.diff(times) > 0, True)]] = True
+        problem = SwitchedProblem(ssms, chain, grid, jnp.asarray(is_decision), starts, index[None])
+        schemes = tuple(choose_scheme(ssm, "auto") for ssm in ssms)
+        w, y, indices, _ = simulate_paths(problem, schemes, jnp.asarray(times), path_key)
+        return self._with_indicators(w[:, 0], indices[:, 0]), y[:, 0]
+
+    def _with_indicators(self, w: jax.Array, indices: jax.Array) -> jax.Array:
+        size = len(self.models[0].state_names)
+        return jnp.concatenate([w[:, :size], jax.nn.one_hot(indices, len(self.models)), w[:, size:]], axis=1)

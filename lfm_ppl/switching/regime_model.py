@@ -1,0 +1,82 @@
+"""One latent force model for all regimes, in which the regime is part of the state.
+
+Results, figures and checks read names, outputs and noise from it. Its states are those of the regimes and an indicator
+for each regime, 1 while the regime holds and 0 otherwise, so that the mean of an indicator is a probability.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from lfm_ppl.model.gaussian import Gaussian
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation import GaussianObservation
+from lfm_ppl.model.state_space import state_space
+from lfm_ppl.switching.switched_model import check_structure
+
+
+def check_models(models: Any) -> dict[str, LatentForceModel]:
+    """Return the models by name of the regime after checks.
+
+    Raises:
+        TypeError: not a mapping of names to latent force models.
+        ValueError: fewer than two; the models differ in states, forces, outputs or deterministics.
+    """
+    if not isinstance(models, Mapping) or not all(isinstance(model, LatentForceModel) for model in models.values()):
+        raise TypeError('models must map the names of the regimes to latent force models, {"calm": model1, "abrupt": '
+                        f"model2}}; got {type(models).__name__}.")
+    if len(models) < 2:
+        raise ValueError(f"models must hold at least two regimes, got {len(models)}; for one take "
+                         "lfm.MarginalLikelihood.")
+    models = {str(name): model for name, model in models.items()}
+    check_structure({f"the regime {name!r}": state_space(model) for name, model in models.items()})
+    for name, model in models.items():
+        if not isinstance(model.observation, GaussianObservation) or jnp.ndim(model.observation.covariance) == 3:
+            raise ValueError(f"the regime {name!r} needs an lfm.GaussianObservation with one covariance for all rows, "
+                             "because regimes are merged by the moments of the state.")
+    return models
+
+
+def joint_model(models: Mapping[str, LatentForceModel], probabilities: jax.Array) -> LatentForceModel:
+    """Return the model whose state (x, indicators) has M + K entries.
+
+    Args:
+        models: by name of the regime.
+        probabilities: (K,), of the regimes at the initial time.
+    """
+    members = list(models.values())
+    first = members[0]
+    size, count = len(first.state_names), len(members)
+
+    def select(functions: Sequence[Callable[..., jax.Array]]) -> Callable[..., jax.Array]:
+        """Return the function of the regime whose indicator is 1."""
+
+        def selected(x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
+            values = [jnp.asarray(function(x[:size], u, t), float) for function in functions]
+            return jnp.tensordot(x[size:], jnp.stack(values), 1)
+
+        return selected
+
+    drift = select([model.dynamics for model in members])
+    initial = Gaussian(jnp.concatenate([first.initial_state.mean, probabilities]),
+                       jnp.pad(first.initial_state.covariance, (0, count)))
+    return LatentForceModel(
+        dynamics=lambda x, u, t: jnp.concatenate([drift(x, u, t), jnp.zeros(count)]),
+        forces=[(name, first.forces[name]) for name in first.force_names],
+        observation=GaussianObservation(
+            select([model.observation.function for model in members]),
+            select([functools.partial(model.observation.covariance_at, row=0) for model in members]),
+            first.observation.angular),
+        initial_state=initial,
+        initial_time=first.initial_time,
+        state_names=(*first.state_names, *models),
+        output_names=first.output_names,
+        units={**first.units, **dict.fromkeys(models, "1")},
+        deterministics={name: select([model.deterministics[name] for model in members])
+                        for name in first.deterministic_names},
+    )
