@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +41,20 @@ from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
+
+
+class RowScores(NamedTuple):
+    """Scores of the rows of the data.
+
+    Attributes:
+        leave_one_out: (T,), log p(y_k | y_-k).
+        one_step_ahead: (T,), log p(y_k | y_1:k-1).
+        residual: (T, D), whitened innovations, NaN where missing.
+    """
+
+    leave_one_out: jax.Array
+    one_step_ahead: jax.Array
+    residual: jax.Array
 
 
 class SeriesLikelihood(dist.Distribution):
@@ -228,6 +242,11 @@ class SeriesLikelihood(dist.Distribution):
     def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
         """Draw a path of a state that is not Gaussian: (x, u) (L, M + R), and its times (L,)."""
         raise NotImplementedError
+
+    def scores(self, y: jax.Array, key: jax.Array) -> RowScores:
+        """Return predictive densities and residuals of the rows of ``y`` (T, D); ``key`` is for random ones."""
+        result = self.smooth(y)
+        return RowScores(self.leave_one_out(y, result), result.log_likelihood, result.whitened_innovation)
 
     def leave_one_out(self, y: jax.Array, smoothed: SmootherResult) -> jax.Array:
         """Return (T,), log p(y_k | y_-k), given the result of `smooth`."""

@@ -2,7 +2,7 @@
 
 1. `regimes` builds the filter problem of each regime on a common time grid, and the transition probabilities.
 2. `log_prob` runs the filter of all regimes, in which the states are merged by their moments (`switching.regimes`).
-3. `smooth` gives probabilities of the regimes and leave-one-out densities, as averages over draws.
+3. `smooth` gives probabilities of the regimes and moments of the state, as averages over draws of regimes.
 4. `sample_path` draws states and regimes given the data; `lfm_ppl.fit` stores such paths.
 5. `sample` simulates the real model by `switching.switched_simulation`, with the chain as its rule.
 
@@ -25,7 +25,7 @@ from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
+from lfm_ppl.inference.series_likelihood import RowScores, SeriesLikelihood, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.resolution import check_resolution
@@ -38,8 +38,10 @@ from lfm_ppl.switching.regimes import (
     MERGINGS,
     RegimeProblem,
     filter_regimes,
+    merge,
+    regime_transitions,
     sample_regimes,
-    transition_probabilities,
+    smooth_path,
 )
 from lfm_ppl.switching.switched_model import SwitchedProblem
 from lfm_ppl.switching.switched_simulation import simulate_paths
@@ -50,7 +52,7 @@ SIMULATION_STEPS = 5
 """Steps of the simulator for one integration step of the filter."""
 
 SMOOTHER_DRAWS = 256
-"""Draws over which the smoother averages; they have the same random numbers in each call."""
+"""Draws of regimes over which the smoother averages; they have the same random numbers in each call."""
 
 
 class RegimeSmootherResult(eqx.Module):
@@ -61,8 +63,6 @@ class RegimeSmootherResult(eqx.Module):
         probability: (K, R), of the R regimes given all observations.
         mean, covariance: (K, n), (K, n, n), of the joint state of mechanism and forces, merged over the regimes.
         log_likelihood: (T,), log p(y_k | y_1:k-1).
-        leave_one_out: (T,), log p(y_k | y_-k).
-        whitened_innovation: (T, D), normal quantiles of the predictive distribution functions, NaN where missing.
         regimes: names of the regimes.
     """
 
@@ -71,8 +71,6 @@ class RegimeSmootherResult(eqx.Module):
     mean: jax.Array
     covariance: jax.Array
     log_likelihood: jax.Array
-    leave_one_out: jax.Array
-    whitened_innovation: jax.Array
     regimes: tuple[str, ...] = eqx.field(static=True)
 
 
@@ -96,7 +94,7 @@ class Switching(SeriesLikelihood):
         rule: linearisation rule; `Cubature()` by default.
         steps: integration steps between two consecutive times; a linear time-invariant model is exact with any number.
         max_step: longest step, in units of time; longer intervals get more steps.
-        initial: (K,), probabilities of the regimes at the initial time; None: equal ones.
+        initial: (K,), probabilities of the regimes at the first observation; None: equal ones.
         merging: "gpb2", K^2 filters a row, or "imm", K filters, which is faster and merges earlier.
 
     Raises:
@@ -167,7 +165,7 @@ class Switching(SeriesLikelihood):
         """Return the filter problems of the regimes and the chain on a time grid; None: that of the data."""
         grid = self.time_grid if grid is None else grid
         problems = tuple(filter_problem(ssm, self.rule, grid) for ssm in self.ssms)
-        return RegimeProblem(problems, self.initial, transition_probabilities(self.rates, grid), self.merging)
+        return RegimeProblem(problems, self.initial, *regime_transitions(self.rates, grid), self.merging)
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log density of ``value`` (T, D), NaN where missing; batch dimensions may lead."""
@@ -197,7 +195,7 @@ class Switching(SeriesLikelihood):
     def smooth(self, y: Any, at: Any = None, steps: int | None = None) -> Any:
         """Smooth: the probabilities of the regimes, and the state, given all observations.
 
-        They are averages over 256 draws of later states, with an error of some 0.01.
+        Both are averages over 256 draws of the regimes, so that probabilities have errors of some 0.02.
 
         Args:
             y: (T, D), NaN where missing.
@@ -206,14 +204,35 @@ class Switching(SeriesLikelihood):
         """
         y = self.checked(y)
         grid = self.time_grid if at is None and steps is None else self._grid(at, steps)
-        regimes, observed = self.regimes(grid), jnp.asarray(grid.observed)
+        # One program: eager operations take longer to compile, one by one.
+        return jax.jit(lambda y: self._smooth(y, grid))(y)
+
+    def _smooth(self, y: jax.Array, grid: TimeGrid) -> RegimeSmootherResult:
+        regimes, requested = self.regimes(grid), jnp.asarray(grid.requested)
         trace = filter_regimes(regimes, y)
-        paths = sample_regimes(jax.random.key(0), regimes, trace, y, SMOOTHER_DRAWS)
-        requested = jnp.asarray(grid.requested)
+        paths = sample_regimes(jax.random.key(0), regimes, trace, SMOOTHER_DRAWS)
+
+        def smooth(path: jax.Array) -> Moments:
+            # The nodes of the smoother begin with the initial time.
+            return jax.tree.map(lambda a: a[requested + 1], smooth_path(regimes, y, path).moments)
+
+        equal = jnp.ones(SMOOTHER_DRAWS)
+        moments = jax.vmap(lambda row: merge(equal, row), in_axes=1)(jax.vmap(smooth)(paths.regime.T))
         return RegimeSmootherResult(
-            jnp.asarray(grid.requested_times, float), paths.probability[requested],
-            paths.moments.mean[requested], paths.moments.covariance[requested], trace.log_likelihood[observed],
-            paths.leave_one_out[observed], trace.residual[observed], self.regime_names)
+            jnp.asarray(grid.requested_times, float), paths.probability[requested], *moments,
+            trace.log_likelihood[jnp.asarray(grid.observed)], self.regime_names)
+
+    def scores(self, y: jax.Array, key: jax.Array) -> RowScores:
+        """Return densities and residuals of the rows, with a path of regimes as a further parameter of the draw.
+
+        The leave-one-out density is log p(y_k | y_-k, r), so that leave-one-out cross-validation weights the paths with
+        the parameters.
+        """
+        regimes, observed = self.regimes(), jnp.asarray(self.time_grid.observed)
+        trace = filter_regimes(regimes, y)
+        path = sample_regimes(key, regimes, trace, 1).regime[:, 0]
+        left_out = smooth_path(regimes, y, path).leave_one_out
+        return RowScores(left_out[observed], trace.log_likelihood[observed], trace.residual[observed])
 
     def _grid(self, at: Any, steps: int | None = None) -> TimeGrid:
         return build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at)
@@ -231,7 +250,7 @@ class Switching(SeriesLikelihood):
         """
         grid = self.time_grid if at is None else self._grid(at)
         regimes = self.regimes(grid)
-        paths = sample_regimes(key, regimes, filter_regimes(regimes, y), y, 1)
+        paths = sample_regimes(key, regimes, filter_regimes(regimes, y), 1)
         requested, times = jnp.asarray(grid.requested), jnp.asarray(grid.requested_times, float)
         states, indices = paths.state[requested, 0], paths.regime[requested, 0]
         candidates = jnp.stack([jax.vmap(ssm.inputs)(states, times) for ssm in self.ssms])
@@ -248,10 +267,8 @@ class Switching(SeriesLikelihood):
         grid = self._grid(None, SIMULATION_STEPS * self.steps)
         distinct = np.unique(times)
         # The decision at the last time has no consequences.
-        lengths = jnp.diff(distinct, prepend=grid.initial_time, append=distinct[-1])
-        transitions = transition_matrices(self.rates, lengths)
-        index = jax.random.categorical(initial_key, jnp.log(self.initial @ transitions[0]))
-        chain = MarkovChain(distinct, transitions[1:])
+        chain = MarkovChain(distinct, transition_matrices(self.rates, jnp.diff(distinct, append=distinct[-1])))
+        index = jax.random.categorical(initial_key, jnp.log(self.initial))
         starts = jax.tree.map(lambda *leaves: jnp.stack(leaves)[index], *(Moments(*ssm.initial()) for ssm in ssms))
         is_decision = np.zeros(len(np.asarray(grid.intervals.observation)), bool)
         is_decision[np.asarray(grid.observed)[np.append(np.diff(times) > 0, True)]] = True

@@ -47,7 +47,7 @@ def joint_model(models: Mapping[str, LatentForceModel], probabilities: jax.Array
 
     Args:
         models: by name of the regime.
-        probabilities: (K,), of the regimes at the initial time.
+        probabilities: (K,), of the regimes at the first observation.
     """
     members = list(models.values())
     first = members[0]

@@ -2,17 +2,17 @@ r"""Filter, smoother and draws of a model that switches between K regimes by a M
 
 The state s is Gaussian in each regime r, with p(r_k = j | y_1:k) beside it. For each interval of the time grid:
 
-1. The chain moves: c_ij = p(r_k-1 = i | y_1:k-1) P_ij.
-2. GPB2 predicts and updates the state of each regime i under each regime j, K^2 filters. IMM first merges the states
-   that enter regime j by their moments, with the weights c_ij / sum_i c_ij, and then takes K filters.
+1. Where a new regime may begin, after an observation, the states of each regime are merged by their moments, and the
+   chain moves: c_ij = p(r_k-1 = i | y_1:k-1) P_ij.
+2. GPB2 takes the state of each regime i on under each regime j, K^2 filters. IMM merges the states that enter regime j
+   by their moments, too, with the weights c_ij / sum_i c_ij, and takes K filters.
 3. The one-step-ahead density is the mixture sum_ij c_ij N(y_k; mu_ij, S_ij), whose terms are the new weights.
-4. All states of a regime j are merged by their moments.
 
 From the last interval to the first, for each of S draws of the later state s_k+1 and its regime j,
 
-5. p(r_k = i | s_k+1, j, y) is proportional to p(r_k = i | y_1:k) P_ij N(s_k+1; m_ij, P_ij), with the predictions (i, j)
-   of step 2, and the smoother's gain gives the Gaussian of s_k in regime i. Regime and state are drawn from this law.
-6. Smoothed probabilities, moments and leave-one-out densities are averages of this law over the draws.
+4. p(r_k = i | s_k+1, j, y) is proportional to p(r_k = i | y_1:k) P_ij N(s_k+1; m_ij, P_ij), with the predictions (i, j)
+   from the merged states, and the smoother's gain gives the Gaussian of s_k in regime i. Both are drawn from this law.
+5. Given a path of regimes the model is that of one filter: its trace goes to the backward scan of the smoother.
 
 Draws are exact given the merged states of the filter.
 
@@ -22,6 +22,7 @@ Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -29,15 +30,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp, ndtr, ndtri
 
-from lfm_ppl.filtering.forward import predict, update_at_end
+from lfm_ppl.filtering.backward import SmootherTrace, backward
+from lfm_ppl.filtering.forward import FilterTrace, predict, update_at_end
 from lfm_ppl.filtering.intervals import TimeGrid, as_arrays, with_observations
-from lfm_ppl.filtering.moments import Moments, Prediction, Record, matvec
+from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem
-from lfm_ppl.filtering.smoothing_kernel import SmoothingKernel, smoothing_kernel
-from lfm_ppl.filtering.update import GaussianUpdate, Update, linearize_observation
+from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
+from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.switching.chain import transition_matrices
-from lfm_ppl.utils.gaussian_residuals import log_density, masked, wrapped
-from lfm_ppl.utils.linalg import cholesky, congruence, diagonal, semidefinite_root, solve_lower
+from lfm_ppl.utils.gaussian_residuals import log_density
+from lfm_ppl.utils.linalg import cholesky, diagonal, semidefinite_root, solve_lower
 
 IMM, GPB2 = MERGINGS = "imm", "gpb2"
 """Methods of merging."""
@@ -51,14 +53,16 @@ class RegimeProblem(NamedTuple):
 
     Attributes:
         problems: of the K regimes.
-        initial: (K,), probabilities of the regimes at the initial time.
-        transitions: (N, K, K), probabilities p(r_k = j | r_k-1 = i) of the intervals.
+        initial: (K,), probabilities of the regimes at the first observation.
+        transitions: (N, K, K), probabilities p(r_k = j | r_k-1 = i) at the starts of the intervals.
+        is_start: (N,), whether an interval is the first after an observation, so that the regime may change.
         merging: one of `MERGINGS`.
     """
 
     problems: tuple[FilterProblem, ...]
     initial: jax.Array
     transitions: jax.Array
+    is_start: jax.Array
     merging: str
 
     @property
@@ -100,15 +104,11 @@ class RegimePaths(NamedTuple):
         state: (N, S, n), draws of the state.
         regime: (N, S), draws of the regime, an index.
         probability: (N, K), of the regimes, given all observations.
-        moments: (N, n), (N, n, n), of the state, merged over the regimes.
-        leave_one_out: (N,), log p(y_k | all other observations), zero without an observation.
     """
 
     state: jax.Array
     regime: jax.Array
     probability: jax.Array
-    moments: Moments
-    leave_one_out: jax.Array
 
 
 class _ConditionalLaw(NamedTuple):
@@ -137,8 +137,8 @@ def merge(weights: jax.Array, moments: Moments) -> Moments:
     return Moments(mean, covariance)
 
 
-def transition_probabilities(rates: jax.Array, grid: TimeGrid) -> jax.Array:
-    """Return the transition probabilities (N, K, K) of the intervals, exp(rates dt).
+def regime_transitions(rates: jax.Array, grid: TimeGrid) -> tuple[jax.Array, jax.Array]:
+    """Return the fields ``transitions`` and ``is_start`` of a `RegimeProblem`.
 
     The regime is constant between two observations: the first interval after an observation carries the transition over
     the whole time to the next, other intervals the identity. After the last observation each interval is a transition.
@@ -149,146 +149,126 @@ def transition_probabilities(rates: jax.Array, grid: TimeGrid) -> jax.Array:
     """
     is_end = np.asarray(grid.intervals.observation) >= 0
     is_end[max(grid.observed) + 1:] = True
-    group = np.append(0, np.cumsum(is_end[:-1]))
-    first = np.unique(group, return_index=True)[1]
+    is_start = np.append(True, is_end[:-1])
+    group = np.cumsum(is_start) - 1
     dwell = jax.ops.segment_sum(jnp.asarray(grid.intervals.length), group, group[-1] + 1)
-    identity = jnp.broadcast_to(jnp.eye(rates.shape[0]), (len(group), *rates.shape))
-    return identity.at[first].set(transition_matrices(rates, dwell))
+    transitions = jnp.broadcast_to(jnp.eye(rates.shape[0]), (len(group), *rates.shape))
+    # The chain begins with the first observation.
+    starts = np.flatnonzero(is_start)[1:]
+    return transitions.at[starts].set(transition_matrices(rates, dwell[1:])), jnp.asarray(is_start)
 
 
-def filter_regimes(regimes: RegimeProblem, y: jax.Array) -> RegimeTrace:
-    """Run the filter on observations (T, D)."""
-    updater = GaussianUpdate(y)
-    starts = [problem.initial() for problem in regimes.problems]
-    updates = [updater.bind(problem, start) for problem, start in zip(regimes.problems, starts, strict=True)]
+def filter_regimes(regimes: RegimeProblem, y: jax.Array, path: jax.Array | None = None) -> Any:
+    """Run the filter on observations (T, D); given a ``path`` (N,) of regimes return its `FilterTrace`."""
+    updater, record = GaussianUpdate(y), Record.LIKELIHOOD if path is None else Record.SMOOTHER
+    initial = _stack([problem.initial() for problem in regimes.problems])
+    updates = [updater.bind(problem, problem.initial()) for problem in regimes.problems]
     rows = with_observations(regimes.grid.intervals, updater.rows())[1]
+    is_pairwise = regimes.merging == GPB2
+    if path is not None:
+        # A chain that takes this path, whose states have one source each.
+        indicators = jax.nn.one_hot(path, len(regimes.problems))
+        transitions = jnp.broadcast_to(indicators[:, None], regimes.transitions.shape)
+        regimes, is_pairwise = regimes._replace(initial=indicators[0], transitions=transitions), False
 
-    def step(carry: RegimeMoments, inputs: tuple) -> tuple[RegimeMoments, RegimeTrace]:
-        transition, intervals, row = inputs
-        joint = carry.probability[:, None] * transition
-        log_weights, moments, distributions = [], [], []
+    def enter(filtered: RegimeMoments, transition: jax.Array) -> RegimeMoments:
+        joint = (filtered.probability[:, None] * transition).T
+        if is_pairwise:
+            sources = jax.tree.map(lambda a: jnp.broadcast_to(a, (*joint.shape, *a.shape[1:])), filtered.moments)
+            return RegimeMoments(joint, sources)
+        merged = jax.vmap(merge, (0, None))(joint, filtered.moments)
+        return RegimeMoments(joint.sum(1, keepdims=True), jax.tree.map(lambda a: a[:, None], merged))
+
+    def step(carry: tuple[RegimeMoments, RegimeMoments], inputs: tuple) -> tuple[tuple, tuple]:
+        previous, filtered = carry
+        transition, is_start, intervals, row = inputs
+        sources = jax.tree.map(lambda a, b: jnp.where(is_start, a, b), enter(filtered, transition), previous)
+        traces, distributions = [], []
         for j, (problem, update, interval) in enumerate(zip(regimes.problems, updates, intervals, strict=True)):
-            sources, weights = carry.moments, joint[:, j]
-            if regimes.merging == IMM:
-                sources, weights = jax.tree.map(lambda a: a[None], merge(weights, sources)), weights.sum()[None]
 
             def filter_source(source: Moments, problem: Any = problem, update: Any = update,
-                              interval: Any = interval) -> tuple:
-                predicted = predict(problem, interval, source).moments
-                updated = update_at_end(problem, update, interval, row, predicted)
-                return updated.log_likelihood, updated.moments, _distribution_function(updated)
+                              interval: Any = interval) -> tuple[FilterTrace, jax.Array]:
+                prediction = predict(problem, interval, source, record=record)
+                updated = update_at_end(problem, update, interval, row, prediction.moments)
+                trace = FilterTrace(None, updated.log_likelihood, prediction.moments, updated.moments, prediction.phi,
+                                    prediction.process_cov, updated._replace(moments=None, log_likelihood=None))
+                return trace, ndtr(updated.innovation / jnp.sqrt((updated.chol**2).sum(-1)))
 
-            log_likelihood, updated, distribution = jax.vmap(filter_source)(sources)
-            log_weights.append(_log(weights) + log_likelihood)
-            moments.append(updated)
-            distributions.append(weights @ distribution)
-        log_weight = jnp.stack(log_weights)
+            trace, distribution = jax.vmap(filter_source)(jax.tree.map(lambda a, j=j: a[j], sources.moments))
+            traces.append(trace)
+            distributions.append(sources.probability[j] @ distribution)
+        trace = _stack(traces)
+        log_weight = _log(sources.probability) + trace.log_likelihood
         total = logsumexp(log_weight)
         weight = jnp.exp(log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
-        filtered = RegimeMoments(weight.sum(1), _stack([merge(*pair) for pair in zip(weight, moments, strict=True)]))
-        residual = ndtri(jnp.clip(jnp.stack(distributions).sum(0), 1e-15, 1 - 1e-15))
-        return filtered, RegimeTrace(total, filtered, jnp.where(jnp.isfinite(row), residual, jnp.nan))
+        filtered = RegimeMoments(weight.sum(1), jax.vmap(merge)(weight, trace.filtered))
+        residual = ndtri(jnp.clip(sum(distributions), 1e-15, 1 - 1e-15))
+        output = RegimeTrace(total, filtered, jnp.where(jnp.isfinite(row), residual, jnp.nan))
+        return (RegimeMoments(weight, trace.filtered), filtered), output if path is None else trace
 
-    start = RegimeMoments(regimes.initial, _stack(starts))
-    inputs = regimes.transitions, regimes.intervals, rows
-    return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), start, inputs)[1]
+    start = RegimeMoments(regimes.initial, initial)
+    carry = enter(start, regimes.transitions[0]), start
+    inputs = regimes.transitions, regimes.is_start, regimes.intervals, rows
+    output = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, inputs)[1]
+    if path is None:
+        return output
+    return jax.vmap(lambda trace, regime: jax.tree.map(lambda a: a[regime, 0], trace))(output, path)._replace(
+        initial=jax.tree.map(lambda a: a[path[0]], initial))
 
 
-def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace, y: jax.Array,
-                   draws: int) -> RegimePaths:
-    """Draw paths of state and regime given the observations (T, D), and average over their conditional laws."""
+def smooth_path(regimes: RegimeProblem, y: jax.Array, path: jax.Array) -> SmootherTrace:
+    """Smooth given a path (N,) of regimes."""
+    return backward(regimes.problems[0], filter_regimes(regimes, y, path))
+
+
+def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace, draws: int) -> RegimePaths:
+    """Draw paths of state and regime given the observations."""
     count, regime_count, size = trace.filtered.moments.mean.shape
     normals = jax.random.normal(key, (count, draws, size))
     gumbels = jax.random.gumbel(jax.random.fold_in(key, 1), (count, draws, regime_count))
-    rows = with_observations(regimes.grid.intervals, y)[1]
 
-    def summarize(law: _ConditionalLaw, filtered: Moments, inputs: tuple) -> RegimePaths:
-        intervals, row, normal, gumbel = inputs
+    def draw(law: _ConditionalLaw, normal: jax.Array, gumbel: jax.Array) -> RegimePaths:
         root = jax.vmap(jax.vmap(semidefinite_root))(law.covariance)
         regime = jnp.argmax(_log(law.weight) + gumbel, axis=1)
-        number = jnp.arange(draws)
-        state = law.mean[number, regime] + matvec(root[law.group, regime], normal)
-        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]),
-                            (law.weight, Moments(law.mean, law.covariance[law.group])))
-        terms = [_log_inverse_density(problem, interval, row, jax.tree.map(lambda a, i=i: a[i], filtered),
-                                      law.mean[:, i], law.covariance[:, i], law.group)
-                 for i, (problem, interval) in enumerate(zip(regimes.problems, intervals, strict=True))]
-        left_out = jnp.log(draws) - logsumexp(_log(law.weight) + jnp.stack(terms, axis=1))
-        return RegimePaths(state, regime, law.weight.mean(0), merge(*flat), left_out)
+        state = law.mean[jnp.arange(draws), regime] + matvec(root[law.group, regime], normal)
+        return RegimePaths(state, regime, law.weight.mean(0))
 
-    def step(later: tuple, inputs: tuple) -> tuple[tuple, RegimePaths]:
-        filtered, transition, later_intervals, rest = inputs
-        paths = summarize(_law_given_later(regimes, filtered, transition, later_intervals, *later),
-                          filtered.moments, rest)
-        return (paths.state, paths.regime), paths
+    def step(later: RegimePaths, inputs: tuple) -> tuple[RegimePaths, RegimePaths]:
+        filtered, transition, intervals, normal, gumbel = inputs
+        law = _law_given_later(regimes, filtered, transition, intervals, later)
+        paths = draw(law, normal, gumbel)
+        return paths, paths
 
-    filtered, rest = trace.filtered, (regimes.intervals, rows, normals, gumbels)
-    end, rest_of_end = jax.tree.map(lambda a: a[-1], (filtered, rest))
+    end = jax.tree.map(lambda a: a[-1], trace.filtered)
     law = _ConditionalLaw(jnp.broadcast_to(end.probability, (draws, regime_count)),
                           jnp.broadcast_to(end.moments.mean, (draws, regime_count, size)),
                           end.moments.covariance[None], jnp.zeros(draws, int))
-    last = summarize(law, end.moments, rest_of_end)
-    earlier_rows = jax.tree.map(lambda a: a[:-1], (filtered, rest))
-    later_rows = jax.tree.map(lambda a: a[1:], (regimes.transitions, regimes.intervals))
-    inputs = earlier_rows[0], *later_rows, earlier_rows[1]
-    paths = jax.lax.scan(step, (last.state, last.regime), inputs, reverse=True)[1]
+    last = draw(law, normals[-1], gumbels[-1])
+    earlier = jax.tree.map(lambda a: a[:-1], (trace.filtered, normals, gumbels))
+    later = jax.tree.map(lambda a: a[1:], (regimes.transitions, regimes.intervals))
+    paths = jax.lax.scan(step, last, (earlier[0], *later, *earlier[1:]), reverse=True)[1]
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), paths, last)
 
 
 def _law_given_later(regimes: RegimeProblem, filtered: RegimeMoments, transition: jax.Array,
-                     intervals: tuple[Any, ...], states: jax.Array, later: jax.Array) -> _ConditionalLaw:
-    """Return the law at the end of an interval given draws of states and regimes at the end of the next."""
-    predicted, kernel = jax.tree.map(lambda *leaves: jnp.stack(leaves),
-                                     *_predictions(regimes, filtered.moments, intervals))
+                     intervals: tuple[Any, ...], later: RegimePaths) -> _ConditionalLaw:
+    """Return the law at the end of an interval given draws of state and regime at the end of the next."""
+    predictions = []
+    for problem, interval in zip(regimes.problems, intervals, strict=True):
+        predicted = jax.vmap(lambda source, problem=problem, interval=interval: predict(
+            problem, interval, source, record=Record.SMOOTHER))(filtered.moments)
+        kernel = jax.vmap(smoothing_kernel)(filtered.moments, predicted.moments, predicted.phi, predicted.process_cov)
+        predictions.append((predicted.moments, kernel))
+    predicted, kernel = _stack(predictions)
     joint = (filtered.probability[:, None] * transition).T
 
-    def given(state: jax.Array, regime: jax.Array) -> tuple[jax.Array, jax.Array]:
-        moments = jax.tree.map(lambda a: a[regime], predicted.moments)
+    def condition(state: jax.Array, regime: jax.Array) -> tuple[jax.Array, jax.Array]:
+        moments = jax.tree.map(lambda a: a[regime], predicted)
         change = matvec(kernel.gain[regime], state - moments.mean)
         return _source_probabilities(joint[regime], moments, state), filtered.moments.mean + change
 
-    weight, mean = jax.vmap(given)(states, later)
-    return _ConditionalLaw(weight, mean, kernel.conditional, later)
-
-
-def _log_inverse_density(problem: FilterProblem, interval: Any, y: jax.Array, centre: Moments, mean: jax.Array,
-                         covariance: jax.Array, group: jax.Array) -> jax.Array:
-    """Return log E[1 / p(y | s)] under N(mean, covariance) for means (S, n) and covariances (G, n, n).
-
-    With f = h(s) ~ N(m, V) and y ~ N(f, R) it is -log N(y; m, R - V) - log |R - V| + log |R|, for V < R; infinite else.
-    """
-    observation = linearize_observation(problem.ssm, problem.rule, problem.shared.observation_jacobian, interval.end,
-                                        jnp.maximum(interval.observation, 0), centre)
-    present = jnp.isfinite(y)
-
-    def factors(covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-        variance = congruence(observation.jacobian, covariance)
-        _, remainder = masked(y, observation.obs_cov - variance, present)
-        factor = cholesky(remainder)
-        return factor.chol, factor.degenerate.any()
-
-    def log_term(mean: jax.Array, chol: jax.Array, is_infinite: jax.Array) -> jax.Array:
-        value = observation.value + matvec(observation.jacobian, mean - centre.mean)
-        residual = jnp.where(present, jnp.where(present, y, 0.0) - value, 0.0)
-        for index in problem.ssm.model.observation.angular:
-            residual = residual.at[index].set(wrapped(residual[index]))
-        density = log_density(solve_lower(chol, residual), chol, present)
-        return jnp.where(is_infinite, jnp.inf, log_det - 2.0 * jnp.log(diagonal(chol)).sum() - density)
-
-    log_det = 2.0 * jnp.log(diagonal(cholesky(masked(y, observation.obs_cov, present)[1]).chol)).sum()
-    chol, is_infinite = jax.vmap(factors)(covariance)
-    return jax.vmap(log_term)(mean, chol[group], is_infinite[group])
-
-
-def _predictions(regimes: RegimeProblem, moments: Moments,
-                 intervals: tuple[Any, ...]) -> list[tuple[Prediction, SmoothingKernel]]:
-    """Return the predictions from the moments (K, ...) of all regimes under each regime, with the smoother's gains."""
-
-    def predict_sources(problem: FilterProblem, interval: Any) -> tuple[Prediction, SmoothingKernel]:
-        predicted = jax.vmap(lambda source: predict(problem, interval, source, record=Record.SMOOTHER))(moments)
-        return predicted, jax.vmap(smoothing_kernel)(moments, predicted.moments, predicted.phi, predicted.process_cov)
-
-    return [predict_sources(*pair) for pair in zip(regimes.problems, intervals, strict=True)]
+    weight, mean = jax.vmap(condition)(later.state, later.regime)
+    return _ConditionalLaw(weight, mean, kernel.conditional, later.regime)
 
 
 def _source_probabilities(weights: jax.Array, predicted: Moments, state: jax.Array) -> jax.Array:
@@ -308,15 +288,10 @@ def _source_probabilities(weights: jax.Array, predicted: Moments, state: jax.Arr
                      weights / jnp.where(weights.sum() > 0, weights.sum(), 1.0))
 
 
-def _distribution_function(updated: Update) -> jax.Array:
-    """Return the predictive distribution functions (D,) of the outputs at the data."""
-    return jnp.asarray(ndtr(updated.innovation / jnp.sqrt((updated.chol**2).sum(-1))))
-
-
 def _log(weights: jax.Array) -> jax.Array:
     """Return the logarithm, -inf for zero with a derivative of zero."""
     return jnp.where(weights > 0, jnp.log(jnp.where(weights > 0, weights, 1.0)), -jnp.inf)
 
 
-def _stack(moments: list[Moments]) -> Moments:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *moments)
+def _stack(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)

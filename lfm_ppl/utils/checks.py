@@ -232,6 +232,7 @@ def _numeric(name: str, value: Any) -> np.ndarray | None:
 
 
 def _message(name: str, expected: str, got: Any, remedy: str) -> str:
-    text = np.array2string(np.asarray(got), threshold=6, precision=6) if np.ndim(got) else (
+    # A matrix in one line.
+    text = " ".join(np.array2string(np.asarray(got), threshold=6, precision=6).split()) if np.ndim(got) else (
         f"{got:.6g}" if isinstance(got, (float, np.floating)) else str(got))
     return f"{name} must be {expected}, got {text}. {remedy}".strip()

@@ -1,0 +1,341 @@
+"""Switching between regimes against enumeration of all paths, other filters of the library and particles."""
+
+import itertools
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+import scipy.linalg
+from scipy import stats
+
+import lfm_ppl as lfm
+from lfm_ppl.filtering.forward import predict
+from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.switching.chain import MarkovChain, transition_matrices
+from lfm_ppl.switching.regimes import filter_regimes, sample_regimes
+
+MERGINGS = ("gpb2", "imm")
+RATES = np.array([[0.0, 0.3], [0.5, 0.0]])
+
+
+def build(scale=1.0, noise=0.1, decay=1.0, lengthscale=1.0, level=0.0):
+    """Return a state that relaxes to a level, driven by a force; both are observed."""
+    return lfm.LatentForceModel(
+        lambda x, u, t: decay * (level - x) + scale * u, {"u": lfm.Matern(1.0, lengthscale, order=0)},
+        lfm.GaussianObservation(lambda x, u, t: x, jnp.array([noise])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+
+
+def observed_force(scale):
+    """Return a force that is observed alone, with a memory that is short compared with the data."""
+    return lfm.LatentForceModel(
+        lambda x, u, t: jnp.zeros(0), {"u": lfm.Matern(scale, 0.01)},
+        lfm.GaussianObservation(lambda x, u, t: u, jnp.array([0.1])),
+        lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
+
+
+def known_state(offset):
+    """Return a model of a known state that decays, observed with an offset: a hidden Markov model."""
+    return lfm.LatentForceModel(
+        lambda x, u, t: -0.3 * x, {}, lfm.GaussianObservation(lambda x, u, t: x + offset, jnp.array([0.5])),
+        lfm.Gaussian(jnp.ones(1), jnp.zeros((1, 1))))
+
+
+def enumerate_paths(switching, y):
+    """Return the log density, probabilities of the regimes and means from all K^T paths.
+
+    Given a path all observations are jointly Gaussian, with a dense covariance of the state-space form, in NumPy.
+    """
+    regimes = switching.regimes()
+    times, ssms = np.asarray(switching.times), switching.ssms
+    count, length = len(ssms), len(times)
+    size = ssms[0].state_dim
+    maps = []
+    for problem in regimes.problems:
+        rows = []
+        for k in range(length):
+            interval = jax.tree.map(lambda a, k=k: jnp.asarray(a)[k], problem.grid.intervals)
+            p = predict(problem, interval, Moments(jnp.zeros(size), jnp.zeros((size, size))), record=Record.SMOOTHER)
+            rows.append(tuple(np.asarray(a) for a in (p.phi, p.moments.mean, p.process_cov)))
+        maps.append(rows)
+    zero = jnp.zeros(size)
+    outputs = [(np.asarray(jax.jacfwd(lambda s, m=ssm: m.observe(m.inputs(s, 0.0), 0.0))(zero)),
+                np.asarray(ssm.observe(ssm.inputs(zero, 0.0), 0.0)), np.asarray(ssm.obs_cov(zero, 0.0, 0)))
+               for ssm in ssms]
+    lengths = np.diff(times)
+    chain = [scipy.linalg.expm(np.asarray(switching.rates) * dt) for dt in lengths]
+    log_weights, means = [], []
+    for path in itertools.product(range(count), repeat=length):
+        log_weight = np.log(switching.initial[path[0]]) + sum(
+            np.log(chain[k][path[k], path[k + 1]]) for k in range(length - 1))
+        mean, covariance = (np.asarray(a) for a in ssms[path[0]].initial())
+        state_means, cross = [], np.zeros((length * size,) * 2)
+        for k, regime in enumerate(path):
+            phi, offset, noise = maps[regime][k]
+            mean, covariance = phi @ mean + offset, phi @ covariance @ phi.T + noise
+            here = slice(k * size, (k + 1) * size)
+            if k:
+                before = cross[(k - 1) * size:k * size, :k * size]
+                cross[here, :k * size] = phi @ before
+                cross[:k * size, here] = cross[here, :k * size].T
+            cross[here, here] = covariance
+            state_means.append(mean)
+        h = scipy.linalg.block_diag(*(outputs[r][0] for r in path))
+        mu = h @ np.concatenate(state_means) + np.concatenate([outputs[r][1] for r in path])
+        s = h @ cross @ h.T + scipy.linalg.block_diag(*(outputs[r][2] for r in path))
+        data = np.ravel(y)
+        log_weights.append(log_weight + stats.multivariate_normal.logpdf(data, mu, s))
+        means.append(np.concatenate(state_means) + cross @ h.T @ np.linalg.solve(s, data - mu))
+    total = np.logaddexp.reduce(log_weights)
+    weights = np.exp(np.array(log_weights) - total)
+    paths = np.array(list(itertools.product(range(count), repeat=length)))
+    probability = np.stack([weights @ (paths == regime) for regime in range(count)], axis=1)
+    return SimpleNamespace(total=total, probability=probability,
+                           mean=(weights @ np.array(means)).reshape(length, size))
+
+
+def exact_cases():
+    rates = np.array([[0.0, 0.4, 0.1], [0.2, 0.0, 0.3], [0.6, 0.1, 0.0]])
+    return {"known state": ({name: known_state(offset) for name, offset in zip("abc", (-1.0, 0.0, 1.0), strict=True)},
+                            rates, np.array([0.0, 0.5, 1.5, 1.7, 3.0])),
+            "short memory": ({"low": observed_force(0.5), "high": observed_force(2.0)}, RATES, np.arange(8.0))}
+
+
+@pytest.mark.parametrize("merging", MERGINGS)
+@pytest.mark.parametrize("case", exact_cases())
+def test_the_density_equals_enumeration_where_merging_is_exact(case, merging):
+    models, rates, times = exact_cases()[case]
+    switching = lfm.Switching(models, rates, times, merging=merging, initial=np.full(len(models), 1 / len(models)))
+    y = np.random.default_rng(0).normal(size=(len(times), 1))
+    exact = enumerate_paths(switching, y)
+    np.testing.assert_allclose(switching.log_prob(y), exact.total, rtol=1e-10)
+    smoothed = switching.smooth(y)
+    # Averages over 256 draws.
+    np.testing.assert_allclose(smoothed.probability, exact.probability, atol=0.07)
+
+
+def test_gpb2_equals_enumeration_for_two_observations():
+    switching = lfm.Switching({"calm": build(0.3), "rough": build(2.0, 0.3)}, RATES, np.array([0.0, 1.0]))
+    y = np.array([[0.3], [1.5]])
+    np.testing.assert_allclose(switching.log_prob(y), enumerate_paths(switching, y).total, rtol=1e-10)
+
+
+def test_draws_have_the_smoothing_distribution():
+    switching = lfm.Switching({"calm": build(0.3), "rough": build(2.0, 0.3)}, RATES, np.arange(8.0))
+    y = np.asarray(switching.sample(jax.random.key(1)))
+    exact, regimes = enumerate_paths(switching, y), switching.regimes()
+    trace = filter_regimes(regimes, jnp.asarray(y))
+    paths = jax.jit(lambda key: sample_regimes(key, regimes, trace, 4000))(jax.random.key(0))
+    # Three standard errors of a probability are .024; merging adds less.
+    np.testing.assert_allclose((paths.regime == 1).mean(1), exact.probability[:, 1], atol=0.03)
+    np.testing.assert_allclose(paths.probability, exact.probability, atol=0.02)
+    np.testing.assert_allclose(paths.state.mean(1), exact.mean, atol=0.05)
+    smoothed = switching.smooth(y)
+    np.testing.assert_allclose(smoothed.mean, exact.mean, atol=0.05)
+
+
+@pytest.mark.parametrize("merging", MERGINGS)
+def test_equal_regimes_are_one_model(merging):
+    times = np.array([0.0, 0.5, 0.5, 2.0, 3.0])
+    y = np.array([[0.1], [np.nan], [0.4], [-1.0], [0.3]])
+    single = lfm.MarginalLikelihood(build(), times)
+    switching = lfm.Switching({"a": build(), "b": build()}, RATES, times, merging=merging)
+    np.testing.assert_allclose(switching.log_prob(y), single.log_prob(y), rtol=1e-10)
+    np.testing.assert_allclose(switching.log_prob_per_observation(y), single.log_prob_per_observation(y), atol=1e-10)
+    at = np.array([0.2, 1.0, 3.0, 4.5])
+    smoothed, expected = switching.smooth(y, at), single.smooth(y, at)
+    np.testing.assert_allclose(smoothed.mean, expected.mean, atol=1e-9)
+    np.testing.assert_allclose(smoothed.covariance, expected.covariance, atol=1e-9)
+    scores = switching.scores(y, jax.random.key(0))
+    np.testing.assert_allclose(scores.leave_one_out, expected.leave_one_out, atol=1e-9)
+    np.testing.assert_allclose(scores.residual, expected.whitened_innovation, atol=1e-8)
+
+
+def test_requested_times_change_no_probability():
+    switching = lfm.Switching({"calm": build(0.3), "rough": build(2.0, 0.3)}, RATES, np.arange(6.0))
+    y = np.asarray(switching.sample(jax.random.key(3)))
+    at = np.arange(0.0, 5.01, 0.25)
+    smoothed = switching.smooth(y, at)
+    np.testing.assert_allclose(smoothed.log_likelihood.sum(), switching.log_prob(y), rtol=1e-9)
+    # The regime is that of the next observation.
+    np.testing.assert_allclose(smoothed.probability[1:3], np.broadcast_to(smoothed.probability[3], (2, 2)), atol=1e-9)
+    np.testing.assert_allclose(smoothed.probability[3], smoothed.probability[4], atol=0.06)
+
+
+def rao_blackwellised(switching, y, particles, key=0):
+    """Return the log likelihood of the particle filter whose particles draw the path of regimes."""
+    times, models = np.asarray(switching.times), switching.models
+    lengths = np.append(np.diff(times), 0.0)
+    chain = MarkovChain(times, transition_matrices(switching.rates, jnp.asarray(lengths)))
+    initial_key, key = jax.random.split(jax.random.key(key))
+    initial = jax.random.categorical(initial_key, jnp.log(switching.initial), shape=(particles,))
+    result = lfm.rao_blackwellised(key, lambda value: models[int(value)], chain, times, y=y, initial=initial,
+                                   particles=particles)
+    return float(result.log_likelihood.sum())
+
+
+PARTICLE_CASES = {"force": lambda: {"calm": build(0.5), "rough": build(2.0)},
+                  "noise": lambda: {"sharp": build(noise=0.05), "vague": build(noise=1.0)},
+                  "level": lambda: {"low": build(0.5), "high": build(0.5, level=4.0)}}
+
+
+@pytest.mark.parametrize("case", PARTICLE_CASES)
+def test_the_density_is_that_of_particles(case):
+    switching = lfm.Switching(PARTICLE_CASES[case](), 0.3 * RATES, np.arange(40.0))
+    y = np.asarray(switching.sample(jax.random.key(2)))
+    assert abs(rao_blackwellised(switching, y, 10_000) - float(switching.log_prob(y))) < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", PARTICLE_CASES)
+def test_long_series_are_within_a_tenth_of_many_particles(case):
+    switching = lfm.Switching(PARTICLE_CASES[case](), 0.3 * RATES, np.arange(200.0))
+    y = np.asarray(switching.sample(jax.random.key(2)))
+    assert abs(rao_blackwellised(switching, y, 100_000) - float(switching.log_prob(y))) < 0.1
+
+
+@pytest.mark.parametrize("merging", MERGINGS)
+def test_gradients_equal_finite_differences(merging):
+    times = np.array([0.0, 0.4, 1.0, 1.0, 2.5, 3.0])
+    y = np.array([[0.1], [0.8], [np.nan], [1.4], [-1.0], [0.3]])
+
+    def log_density(z):
+        rates = jnp.array([[0.0, 1.0], [0.0, 0.0]]) * z[0] + jnp.array([[0.0, 0.0], [1.0, 0.0]]) * z[1]
+        models = {"calm": build(z[2], z[3]), "rough": build(2.0, z[3], z[4])}
+        return lfm.Switching(models, rates, times, merging=merging, initial=jnp.stack([z[5], 1 - z[5]])).log_prob(y)
+
+    z, step = jnp.array([0.3, 0.5, 0.4, 0.2, 0.9, 0.7]), 1e-5
+    function = jax.jit(log_density)
+    differences = [(function(z.at[i].add(step)) - function(z.at[i].add(-step))) / (2 * step) for i in range(len(z))]
+    np.testing.assert_allclose(jax.grad(function)(z), differences, rtol=1e-6, atol=1e-8)
+
+
+def test_a_regime_that_cannot_be_reached_has_no_influence():
+    times, y = np.arange(4.0), np.array([[0.1], [0.4], [-0.2], [0.3]])
+    switching = lfm.Switching({"a": build(), "b": build(5.0)}, np.zeros((2, 2)), times, initial=[1.0, 0.0])
+    np.testing.assert_allclose(switching.log_prob(y), lfm.MarginalLikelihood(build(), times).log_prob(y), rtol=1e-10)
+
+    def log_density(rate):
+        rates = jnp.array([[0.0, 1.0], [0.0, 0.0]]) * rate
+        return lfm.Switching({"a": build(), "b": build(5.0)}, rates, times, initial=[1.0, 0.0]).log_prob(y)
+
+    assert np.isfinite(jax.grad(log_density)(0.0))
+
+
+def test_impossible_data_have_a_density_of_minus_infinity():
+    def model(offset):
+        return lfm.LatentForceModel(lambda x, u, t: -x, {}, lfm.GaussianObservation(
+            lambda x, u, t: x + offset, jnp.zeros(1)), lfm.Gaussian(jnp.ones(1), jnp.zeros((1, 1))))
+
+    switching = lfm.Switching({"a": model(0.0), "b": model(1.0)}, RATES, np.arange(3.0))
+    value, gradient = jax.value_and_grad(switching.log_prob)(jnp.full((3, 1), 7.0))
+    assert value == -np.inf and np.all(gradient == 0.0)
+
+
+def test_simulations_have_the_moments_of_the_chain():
+    times = np.array([0.0, 0.5, 1.0, 3.0])
+    models = {"low": build(0.5, level=-2.0), "high": build(0.5, level=3.0)}
+    switching = lfm.Switching(models, RATES, times, initial=[0.8, 0.2])
+    w, y = jax.jit(jax.vmap(switching.simulate))(jax.random.split(jax.random.key(0), 4000))
+    expected = np.array([0.8, 0.2]) @ np.asarray(
+        [scipy.linalg.expm(np.asarray(switching.rates) * t) for t in times])
+    np.testing.assert_allclose(np.asarray(w[:, :, 1:3].mean(0)), expected, atol=0.03)
+    assert np.all(w[:, :, 1] + w[:, :, 2] == 1.0)
+    np.testing.assert_allclose(np.var(np.asarray(y - w[:, :, :1])), 0.1, rtol=0.05)
+
+
+def test_nonlinear_regimes_are_linearised():
+    def model(sign):
+        return lfm.LatentForceModel(
+            lambda x, u, t: sign * x - x**3 + u, {"u": lfm.Matern(0.3, 1.0)},
+            lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])), lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
+
+    times = np.arange(0.0, 6.0, 0.5)
+    switching = lfm.Switching({"well": model(1.0), "flat": model(0.0)}, np.zeros((2, 2)), times, initial=[1.0, 0.0])
+    y = np.asarray(switching.sample(jax.random.key(0)))
+    single = lfm.MarginalLikelihood(model(1.0), times, iterations=0)
+    np.testing.assert_allclose(switching.log_prob(y), single.log_prob(y), rtol=1e-9)
+
+
+def regimes_model(times, y=None):
+    leave = numpyro.sample("leave", dist.LogNormal(-1.5, 0.5))
+    rates = jnp.array([[-1.0, 1.0], [1.0, -1.0]]) * leave
+    numpyro.sample("y", lfm.Switching({"calm": build(0.3), "rough": build(2.0)}, rates, times), obs=y)
+
+
+def test_a_fit_has_paths_of_regimes_and_forecasts():
+    times = np.arange(0.0, 20.0, 0.5)
+    switching = lfm.Switching({"calm": build(0.3), "rough": build(2.0)}, 0.2 * RATES, times)
+    w, y = switching.simulate(jax.random.key(4))
+    result = lfm.fit(regimes_model, times, y, sampler="map", samples=100, progress=False)
+    states = result["trajectories"]["states"]
+    assert list(states["state"].values) == ["x0", "calm", "rough"]
+    probability = states.sel(state="rough", at=times).mean(("chain", "draw"))
+    assert np.isin(states.sel(state=["calm", "rough"]), [0.0, 1.0]).all()
+    assert np.mean((probability > 0.5) == np.asarray(w[:, 2], bool)) > 0.75
+    forecast = lfm.forecast(result, regimes_model, np.linspace(20.0, 40.0, 5), progress=False)
+    # The chain forgets: both regimes are equally probable in the end.
+    assert abs(forecast["predictions"]["states"].sel(state="rough")[..., -1].mean() - 0.5) < 0.2
+    with pytest.raises(ValueError, match="switches between regimes"):
+        lfm.check_accuracy(result, regimes_model, progress=False)
+
+
+@pytest.mark.slow
+def test_rates_are_calibrated():
+    """The rank of the true rates among quantiles of their posterior, on a grid, is uniform over 100 simulations."""
+    times, prior_mean, prior_sd = np.arange(0.0, 100.0, 0.5), np.log(0.15), 0.6
+    models = {"calm": build(0.3), "rough": build(2.0)}
+    grid = np.linspace(-3.0, 3.0, 25)
+    points = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
+
+    def switching(z):
+        q = jnp.exp(prior_mean + prior_sd * z)
+        return lfm.Switching(models, jnp.array([[-1.0, 1.0], [0.0, 0.0]]) * q[0]
+                             + jnp.array([[0.0, 0.0], [1.0, -1.0]]) * q[1], times)
+
+    def ranks(key):
+        prior_key, data_key = jax.random.split(key)
+        z = jax.random.normal(prior_key, (2,))
+        y = switching(z).sample(data_key)
+        log_density = jax.vmap(lambda z: switching(z).log_prob(y) - 0.5 * (z**2).sum())(points)
+        weight = jax.nn.softmax(log_density).reshape(25, 25)
+        marginals = jnp.stack([weight.sum(1), weight.sum(0)])
+        cumulative = jnp.cumsum(marginals, axis=1) - 0.5 * marginals
+        return jax.vmap(lambda value, c: jnp.interp(value, grid, c))(z, cumulative)
+
+    values = np.asarray(jax.lax.map(jax.jit(ranks), jax.random.split(jax.random.key(0), 100)))
+    for column in values.T:
+        assert stats.kstest(column, "uniform").pvalue > 0.01
+        assert 0.89 <= np.mean((column > 0.025) & (column < 0.975)) <= 1.0
+
+
+@pytest.mark.parametrize(("change", "match"), [
+    ({"rates": np.zeros((3, 3))}, r"rates must be a matrix \(2, 2\)"),
+    ({"rates": [[0.0, -0.1], [0.2, 0.0]]}, "must not be negative"),
+    ({"rates": [[0.9, 0.1], [0.2, 0.8]]}, "transition probabilities"),
+    ({"rates": [[0.0, np.inf], [0.2, 0.0]]}, "finite"),
+    ({"initial": [0.5, 0.6]}, "sum to 1"),
+    ({"initial": [1.0]}, "2 probabilities"),
+    ({"merging": "gpb1"}, "merging"),
+    ({"models": {"a": build()}}, "at least two regimes"),
+    ({"models": {"a": build(), "b": known_state(0.0)}}, "other states, forces"),
+    ({"models": {"a": build(), "u": build()}}, "'u'"),
+])
+def test_malformed_arguments_have_one_line(change, match):
+    arguments = {"models": {"a": build(), "b": build()}, "rates": RATES, "times": np.arange(3.0)} | change
+    with pytest.raises(ValueError, match=match) as error:
+        lfm.Switching(**arguments)
+    assert "\n" not in str(error.value)
+
+
+def test_models_of_another_type_are_refused():
+    with pytest.raises(TypeError, match="map the names of the regimes"):
+        lfm.Switching([build(), build()], RATES, np.arange(3.0))
+    counts = lfm.LatentForceModel(
+        lambda x, u, t: jnp.zeros(0), {"u": lfm.Matern(1.0, 1.0)}, lfm.PoissonObservation(lambda x, u, t: u),
+        lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
+    with pytest.raises(ValueError, match="GaussianObservation"):
+        lfm.Switching({"a": counts, "b": counts}, RATES, np.arange(3.0))
