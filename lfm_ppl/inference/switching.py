@@ -144,10 +144,10 @@ class Switching(SeriesLikelihood):
 
     def with_settings(self, **settings: Any) -> Switching:
         """Return the same distribution with another ``rule``, ``steps`` or ``max_step``."""
-        known = ("rule", "steps", "max_step")
+        names = ("rule", "steps", "max_step")
         for name in settings:
-            if name not in known:
-                raise ValueError(f"{name} is not a setting of lfm.Switching, whose settings are {', '.join(known)}.")
+            if name not in names:
+                raise ValueError(f"{name} is not a setting of lfm.Switching, whose settings are {', '.join(names)}.")
         models = dict(zip(self.regime_names, self.models, strict=True))
         return Switching(models, self.rates, self.times, **{**self.settings, **settings})
 
@@ -200,7 +200,7 @@ class Switching(SeriesLikelihood):
         Args:
             y: (T, D), NaN where missing.
             at: (K,) requested times; None: the times of the data.
-            steps: integration steps between two consecutive times; None: those of the distribution.
+            steps: integration steps between two consecutive times; None: the number of the distribution.
         """
         y = self.checked(y)
         grid = self.time_grid if at is None and steps is None else self._grid(at, steps)

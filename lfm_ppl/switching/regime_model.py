@@ -1,7 +1,7 @@
 """One latent force model for all regimes, in which the regime is part of the state.
 
-Results, figures and checks read names, outputs and noise from it. Its states are those of the regimes and an indicator
-for each regime, 1 while the regime holds and 0 otherwise, so that the mean of an indicator is a probability.
+Results, figures and checks read names, outputs and noise from it. Its state is that of the regimes, and an indicator of
+each regime, 1 while the regime holds and 0 otherwise, so that the mean of an indicator is a probability.
 """
 
 from __future__ import annotations

@@ -158,31 +158,39 @@ def regime_transitions(rates: jax.Array, grid: TimeGrid) -> tuple[jax.Array, jax
     return transitions.at[starts].set(transition_matrices(rates, dwell[1:])), jnp.asarray(is_start)
 
 
-def filter_regimes(regimes: RegimeProblem, y: jax.Array, path: jax.Array | None = None) -> Any:
-    """Run the filter on observations (T, D); given a ``path`` (N,) of regimes return its `FilterTrace`."""
-    updater, record = GaussianUpdate(y), Record.LIKELIHOOD if path is None else Record.SMOOTHER
+def filter_regimes(regimes: RegimeProblem, y: jax.Array) -> RegimeTrace:
+    """Run the filter on observations (T, D)."""
+    return _forward(regimes, y, Record.LIKELIHOOD)[0]
+
+
+def filter_path(regimes: RegimeProblem, y: jax.Array, path: jax.Array) -> FilterTrace:
+    """Run the filter given a path (N,) of regimes, as that of a chain that takes this path with certainty."""
+    indicators = jax.nn.one_hot(path, len(regimes.problems))
+    transitions = jnp.broadcast_to(indicators[:, None], regimes.transitions.shape)
+    certain = regimes._replace(initial=indicators[0], transitions=transitions, merging=IMM)
+    trace = _forward(certain, y, Record.SMOOTHER)[1]
     initial = _stack([problem.initial() for problem in regimes.problems])
+    return jax.vmap(lambda trace, regime: jax.tree.map(lambda a: a[regime, 0], trace))(trace, path)._replace(
+        initial=jax.tree.map(lambda a: a[path[0]], initial))
+
+
+def smooth_path(regimes: RegimeProblem, y: jax.Array, path: jax.Array) -> SmootherTrace:
+    """Smooth given a path (N,) of regimes."""
+    return backward(regimes.problems[0], filter_path(regimes, y, path))
+
+
+def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[RegimeTrace, FilterTrace | None]:
+    """Run the forward scan; of a `Record.SMOOTHER` return the traces (N, K, S, ...) of regimes and sources, too."""
+    updater = GaussianUpdate(y)
+    initial = RegimeMoments(regimes.initial, _stack([problem.initial() for problem in regimes.problems]))
     updates = [updater.bind(problem, problem.initial()) for problem in regimes.problems]
     rows = with_observations(regimes.grid.intervals, updater.rows())[1]
-    is_pairwise = regimes.merging == GPB2
-    if path is not None:
-        # A chain that takes this path, whose states have one source each.
-        indicators = jax.nn.one_hot(path, len(regimes.problems))
-        transitions = jnp.broadcast_to(indicators[:, None], regimes.transitions.shape)
-        regimes, is_pairwise = regimes._replace(initial=indicators[0], transitions=transitions), False
-
-    def enter(filtered: RegimeMoments, transition: jax.Array) -> RegimeMoments:
-        joint = (filtered.probability[:, None] * transition).T
-        if is_pairwise:
-            sources = jax.tree.map(lambda a: jnp.broadcast_to(a, (*joint.shape, *a.shape[1:])), filtered.moments)
-            return RegimeMoments(joint, sources)
-        merged = jax.vmap(merge, (0, None))(joint, filtered.moments)
-        return RegimeMoments(joint.sum(1, keepdims=True), jax.tree.map(lambda a: a[:, None], merged))
 
     def step(carry: tuple[RegimeMoments, RegimeMoments], inputs: tuple) -> tuple[tuple, tuple]:
-        previous, filtered = carry
+        sources, merged = carry
         transition, is_start, intervals, row = inputs
-        sources = jax.tree.map(lambda a, b: jnp.where(is_start, a, b), enter(filtered, transition), previous)
+        entering = _enter_regimes(merged, transition, regimes.merging)
+        sources = jax.tree.map(lambda a, b: jnp.where(is_start, a, b), entering, sources)
         traces, distributions = [], []
         for j, (problem, update, interval) in enumerate(zip(regimes.problems, updates, intervals, strict=True)):
 
@@ -204,21 +212,22 @@ def filter_regimes(regimes: RegimeProblem, y: jax.Array, path: jax.Array | None 
         filtered = RegimeMoments(weight.sum(1), jax.vmap(merge)(weight, trace.filtered))
         residual = ndtri(jnp.clip(sum(distributions), 1e-15, 1 - 1e-15))
         output = RegimeTrace(total, filtered, jnp.where(jnp.isfinite(row), residual, jnp.nan))
-        return (RegimeMoments(weight, trace.filtered), filtered), output if path is None else trace
+        recorded = None if record is Record.LIKELIHOOD else trace
+        return (RegimeMoments(weight, trace.filtered), filtered), (output, recorded)
 
-    start = RegimeMoments(regimes.initial, initial)
-    carry = enter(start, regimes.transitions[0]), start
+    carry = _enter_regimes(initial, regimes.transitions[0], regimes.merging), initial
     inputs = regimes.transitions, regimes.is_start, regimes.intervals, rows
-    output = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, inputs)[1]
-    if path is None:
-        return output
-    return jax.vmap(lambda trace, regime: jax.tree.map(lambda a: a[regime, 0], trace))(output, path)._replace(
-        initial=jax.tree.map(lambda a: a[path[0]], initial))
+    return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, inputs)[1]
 
 
-def smooth_path(regimes: RegimeProblem, y: jax.Array, path: jax.Array) -> SmootherTrace:
-    """Smooth given a path (N,) of regimes."""
-    return backward(regimes.problems[0], filter_regimes(regimes, y, path))
+def _enter_regimes(filtered: RegimeMoments, transition: jax.Array, merging: str) -> RegimeMoments:
+    """Return joint probabilities (K, S) of regimes and their sources after a transition, and the sources' moments."""
+    joint = (filtered.probability[:, None] * transition).T
+    if merging == GPB2:
+        sources = jax.tree.map(lambda a: jnp.broadcast_to(a, (*joint.shape, *a.shape[1:])), filtered.moments)
+        return RegimeMoments(joint, sources)
+    merged = jax.vmap(merge, (0, None))(joint, filtered.moments)
+    return RegimeMoments(joint.sum(1, keepdims=True), jax.tree.map(lambda a: a[:, None], merged))
 
 
 def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace, draws: int) -> RegimePaths:
