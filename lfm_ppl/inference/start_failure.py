@@ -15,6 +15,7 @@ from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.inference.switching import Switching
 
 
 def start_failure(bound: BoundModel) -> str:
@@ -79,8 +80,8 @@ def _likelihood_failure(bound: BoundModel, z: Any) -> str | None:
 def _series_failure(member: SeriesLikelihood, y: Any) -> str:
     if isinstance(member, ConstrainedLikelihood):
         return "the likelihood under constraints is not finite: they may be impossible together with the data."
-    if not member.has_gaussian_state:
-        return "the filter of all regimes breaks down; smooth the data with the model of each regime to see where."
+    if isinstance(member, Switching):
+        return member.breakdown(member.checked(y))
     if member.is_family:
         return family_breakdown(member.ssm, member.rule, member.time_grid, y, member.site_settings)
     return breakdown(member.ssm, member.rule, member.time_grid, y) or (

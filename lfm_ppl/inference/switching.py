@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lfm_ppl.filtering.breakdown import FilterWarning
 from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
@@ -101,6 +102,9 @@ class Switching(SeriesLikelihood):
         ValueError, TypeError: models of other states or outputs; rates or probabilities that are none; and as
             `lfm_ppl.filter`. In compiled code a failure is a log density of -inf.
 
+    Warns:
+        FilterWarning: outside of compiled code, where the log density is -inf: the first row at which it is.
+
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> def build(scale):
@@ -174,7 +178,17 @@ class Switching(SeriesLikelihood):
             return jax.vmap(self.log_prob)(value)
         for model in self.models:
             check_resolution(model, self.times, value)
-        return finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), self.checked(value))
+        y = self.checked(value)
+        log_likelihood = finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y)
+        if checks.concrete(log_likelihood) == -np.inf:
+            checks.warn(self.breakdown(y), FilterWarning)
+        return log_likelihood
+
+    def breakdown(self, y: jax.Array) -> str:
+        """Return a sentence on the first row at which the density is not finite."""
+        row = int(jnp.argmin(jnp.isfinite(self._one_step_ahead(y))))
+        return (f"the filter breaks down in all regimes at row {row}, t = {float(self.times[row]):g}: the observation "
+                "is impossible, or the innovation covariance is not positive definite.")
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation."""

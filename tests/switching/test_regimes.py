@@ -233,6 +233,8 @@ def test_impossible_data_have_a_density_of_minus_infinity():
     switching = lfm.Switching({"a": model(0.0), "b": model(1.0)}, RATES, np.arange(3.0))
     value, gradient = jax.value_and_grad(switching.log_prob)(jnp.full((3, 1), 7.0))
     assert value == -np.inf and np.all(gradient == 0.0)
+    with pytest.warns(lfm.FilterWarning, match="row 0"):
+        switching.log_prob(np.full((3, 1), 7.0))
 
 
 def test_simulations_have_the_moments_of_the_chain():
