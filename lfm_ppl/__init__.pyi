@@ -82,6 +82,11 @@ from .results.plots import plot_trace as plot_trace
 from .results.scoring import score as score
 from .results.series import select_series as select_series
 from .results.sites import select_site as select_site
+from .space.eigenfunctions import LaplaceBasis as LaplaceBasis
+from .space.equations import heat as heat
+from .space.equations import wave as wave
+from .space.fields import SeparableField as SeparableField
+from .space.fields import SpectralField as SpectralField
 from .switching.rao_blackwellised import rao_blackwellised as rao_blackwellised
 from .switching.rule import SwitchingRule as SwitchingRule
 from .switching.rule import Thermostat as Thermostat

@@ -1,0 +1,162 @@
+r"""Eigenfunctions of the Laplacian on an interval or a rectangle.
+
+With x the distance from the lower end of an edge of length L, the orthonormal functions of one dimension are
+
+    dirichlet:  sqrt(2 / L) sin(w x),                            w = n pi / L,    n = 1, 2, ...
+    neumann:    sqrt(1 / L), sqrt(2 / L) cos(w x),               w = n pi / L,    n = 0, 1, ...
+    periodic:   sqrt(1 / L), sqrt(2 / L) cos(w x) and sin(w x),  w = 2 n pi / L,  n = 0, 1, ...
+
+Those of a rectangle are their products, with the squared wavenumber w_1^2 + w_2^2.
+
+Source: Courant and Hilbert (1953), Methods of Mathematical Physics I, chapter V.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from scipy.special import roots_legendre
+
+from lfm_ppl.utils import checks
+
+BOUNDARIES = ("dirichlet", "neumann", "periodic")
+
+
+class LaplaceBasis(eqx.Module):
+    r"""The leading eigenfunctions of the Laplacian, ``-laplacian phi_j = w_j^2 phi_j``, orthonormal on a domain.
+
+    A field is expanded as ``x(r, t) = sum_j c_j(t) phi_j(r)``. The functions are in the order of their wavenumbers.
+
+    Args:
+        domain: (low, high), or ((low, high), (low, high)) for a rectangle, in units of length.
+        modes: number of functions, or a pair for a rectangle; periodic edges need odd numbers: a constant and pairs of
+            cosine and sine.
+        boundary: "dirichlet" (the field is zero at the edges), "neumann" (no flux through them) or "periodic".
+
+    Raises:
+        ValueError, TypeError: the domain is empty, a number of modes is not positive, or the boundary is unknown.
+
+    Example:
+        >>> import numpy as np
+        >>> basis = LaplaceBasis((0.0, 2.0), 3)
+        >>> basis.functions(np.array([0.5, 1.0])).shape, float(basis.wavenumbers[0].round(4))
+        ((2, 3), 1.5708)
+
+    Source: Courant and Hilbert (1953), Methods of Mathematical Physics I, chapter V.
+    """
+
+    domain: tuple[tuple[float, float], ...] = eqx.field(static=True)
+    modes: tuple[int, ...] = eqx.field(static=True)
+    boundary: str = eqx.field(static=True)
+
+    def __init__(self, domain: Any, modes: int | Sequence[int], boundary: str = "dirichlet"):
+        edges = checks.concrete(domain)
+        if edges is None or edges.shape not in ((2,), (1, 2), (2, 2)) or not (np.diff(edges) > 0).all():
+            raise ValueError("domain must be (low, high), or two such pairs for a rectangle, with low < high; got "
+                             f"{domain!r}.")
+        checks.finite("domain", edges)
+        self.domain = tuple((float(low), float(high)) for low, high in np.atleast_2d(edges))
+        self.modes = tuple(modes) if isinstance(modes, Sequence) else (modes,)
+        if len(self.modes) != len(self.domain):
+            raise ValueError("modes must hold a number for each dimension of the domain, "
+                             f"{len(self.domain)}; got {modes!r}.")
+        checks.one_of("boundary", boundary, BOUNDARIES)
+        for count in self.modes:
+            checks.positive_integer("modes", count)
+            if boundary == "periodic" and count % 2 == 0:
+                raise ValueError(f"modes must be odd for periodic edges, a constant and pairs; got {count}.")
+        self.boundary = boundary
+
+    @property
+    def wavenumbers(self) -> np.ndarray:
+        """The wavenumbers w_j (J,), in 1/length."""
+        return _ordered(self)[1]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coefficients of a field among the states of a model: "mode 0", "mode 1", ..."""
+        return tuple(f"mode {index}" for index in range(len(self.wavenumbers)))
+
+    def functions(self, points: ArrayLike) -> Any:
+        """Return phi_j (P, J) at places (P,) or (P, d).
+
+        Raises:
+            ValueError: a place lies outside of the domain. Inside of compiled code there is no check.
+        """
+        places = place_array("points", points, len(self.domain))
+        xp = jnp if checks.traced(places) else np
+        if xp is np:
+            self._check_inside(places)
+        value: Any = 1.0
+        for axis, (low, high) in enumerate(self.domain):
+            orders = _ordered(self)[0][:, axis]
+            angle = _wavenumber(self.boundary, orders, high - low) * (places[:, axis, None] - low)
+            is_sine = (orders > 0) & (orders % 2 == 0 if self.boundary == "periodic" else self.boundary == "dirichlet")
+            amplitude = np.sqrt(np.where(orders == 0, 1.0, 2.0) / (high - low))
+            value = value * amplitude * xp.where(is_sine, xp.sin(angle), xp.cos(angle))
+        return value
+
+    def weights(self, points: ArrayLike) -> tuple[Any, Any]:
+        """Return the weights (P, J) of the coefficients in the field at places, and the variance beyond them, zero."""
+        return self.functions(points), np.zeros(np.shape(points)[0])
+
+    def coefficients(self, function: Callable[[Any], ArrayLike]) -> jax.Array:
+        """Return the coefficients (J,) of a field, ``int phi_j(r) function(r) dr`` by Gauss-Legendre quadrature.
+
+        Args:
+            function: maps places (P,), or (P, 2) in a rectangle, to values (P,); smooth.
+
+        Raises:
+            ValueError: the function returns values of another shape.
+        """
+        nodes, weights = zip(*(roots_legendre(4 * count + 100) for count in self.modes), strict=True)
+        scaled = [low + 0.5 * (high - low) * (x + 1.0) for (low, high), x in zip(self.domain, nodes, strict=True)]
+        points = np.stack([grid.ravel() for grid in np.meshgrid(*scaled, indexing="ij")], axis=1)
+        weight = functools.reduce(np.multiply.outer, weights).ravel() * np.prod(0.5 * np.diff(self.domain))
+        values = jnp.asarray(function(points[:, 0] if len(self.domain) == 1 else points))
+        if values.shape != weight.shape:
+            raise ValueError(f"function must return one value for each place, shape {weight.shape}; it returned shape "
+                             f"{values.shape}.")
+        return jnp.asarray(self.functions(points).T * weight) @ values
+
+    def _check_inside(self, places: np.ndarray) -> None:
+        checks.finite("points", places)
+        low, high = np.transpose(self.domain)
+        rounding = 1e-9 * (high - low)
+        outside = ((places < low - rounding) | (places > high + rounding)).any(axis=1)
+        if outside.any():
+            raise ValueError(f"points[{outside.argmax()}] = {places[outside.argmax()].tolist()} lies outside of the "
+                             f"domain {self.domain}.")
+
+
+def place_array(name: str, points: ArrayLike, dimension: int | None = None) -> Any:
+    """Return places (P,) or (P, d) as an array (P, d); ``dimension`` None: any number of dimensions."""
+    places: Any = points if checks.traced(points) else np.asarray(points, float)
+    places = places[:, None] if places.ndim == 1 else places
+    if places.ndim != 2 or places.shape[0] == 0 or places.shape[1] != (dimension or places.shape[1]):
+        form = {None: "(P,) or (P, d)", 1: "(P,)"}.get(dimension, f"(P, {dimension})")
+        raise ValueError(f"{name} must be an array of places {form}, got shape {np.shape(points)}.")
+    return places
+
+
+def _wavenumber(boundary: str, orders: np.ndarray, length: float) -> np.ndarray:
+    return np.pi / length * (2.0 * np.ceil(orders / 2) if boundary == "periodic" else orders)
+
+
+@functools.lru_cache(maxsize=64)
+def _ordered(basis: LaplaceBasis) -> tuple[np.ndarray, np.ndarray]:
+    """Return the orders n (J, d) of the functions in each dimension, and the wavenumbers (J,)."""
+    first = int(basis.boundary == "dirichlet")
+    grids = np.meshgrid(*(np.arange(first, first + count) for count in basis.modes), indexing="ij")
+    orders = np.stack([grid.ravel() for grid in grids], axis=1)
+    squares = np.sum([_wavenumber(basis.boundary, orders[:, axis], high - low)**2
+                      for axis, (low, high) in enumerate(basis.domain)], axis=0)
+    ranks = np.argsort(squares, kind="stable")
+    return orders[ranks], np.sqrt(squares[ranks])

@@ -1,0 +1,159 @@
+r"""The heat and the wave equation with an unknown source, as latent force models of their eigenfunctions.
+
+1. The field is expanded in the eigenfunctions of the Laplacian, ``x(r, t) = sum_j c_j(t) phi_j(r)``, and so is its
+   source, a `SpectralField` with forces u_j.
+2. Every coefficient has an ordinary differential equation of its own,
+
+       heat:  c_j' = -(diffusivity w_j^2 + decay) c_j + sqrt(S(w_j)) u_j,
+       wave:  c_j'' = -speed^2 w_j^2 c_j - damping c_j' + sqrt(S(w_j)) u_j.
+
+3. Sensors observe the field at places, which is linear in the coefficients. The model is linear and time-invariant, so
+   that filter, smoother and likelihood are exact for these modes.
+
+Source: Särkkä, Álvarez and Lawrence (2019), IEEE Transactions on Automatic Control 64, section V; Hartikainen (2013),
+doctoral thesis, section 3.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from lfm_ppl.forces.parameters import non_negative_parameter
+from lfm_ppl.model.gaussian import Gaussian
+from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation import GaussianObservation
+from lfm_ppl.space.eigenfunctions import LaplaceBasis
+from lfm_ppl.space.fields import SpectralField
+from lfm_ppl.utils import checks
+
+Source = SpectralField | LaplaceBasis
+Sensors = ArrayLike | Callable[[jax.Array], jax.Array]
+
+
+def heat(source: Source, diffusivity: ArrayLike, decay: ArrayLike, *, sensors: Sensors, noise: Any,
+         initial: Gaussian | None = None, initial_time: Any = None, output_names: Sequence[str] | None = None,
+         units: Mapping[str, str] | None = None) -> LatentForceModel:
+    r"""Return the heat equation with an unknown source, ``x_t = diffusivity laplacian x - decay x + s(r, t)``.
+
+    The states are the coefficients of the basis, "mode 0", "mode 1", ...; the forces are those of the source.
+
+    Args:
+        source: the space-time process s, in units of x per time; a basis alone: no source.
+        diffusivity: in length^2/time; zero or above.
+        decay: rate at which heat is lost to the surroundings, in 1/time; zero or above.
+        sensors: places (D,) or (D, d) in the domain, or a function of time that returns them.
+        noise: variance of the measurements, or any covariance of `GaussianObservation`.
+        initial: distribution of the coefficients (J,) at the initial time, see `LaplaceBasis.coefficients`; None: the
+            field is zero.
+        initial_time: time of the initial field; None: the first time of the data.
+        output_names: of the D sensors.
+        units: as of `LatentForceModel`.
+
+    Raises:
+        TypeError: the source is neither a field nor a basis.
+        ValueError: a sensor lies outside of the domain, a parameter is negative, or a shape is wrong.
+
+    Example:
+        >>> import numpy as np
+        >>> import lfm_ppl as lfm
+        >>> basis = lfm.LaplaceBasis((0.0, 1.0), 8, "neumann")
+        >>> source = lfm.SpectralField(basis, lfm.Matern(1.0, 0.4), lfm.Matern(1.0, 2.0))
+        >>> model = lfm.heat(source, 0.02, 0.1, sensors=np.array([0.1, 0.5, 0.9]), noise=0.01)
+        >>> len(model.state_names), model.output_names
+        (8, ('sensor 0', 'sensor 1', 'sensor 2'))
+
+    Source: Särkkä, Álvarez and Lawrence (2019), IEEE Transactions on Automatic Control 64, section V.
+    """
+    basis, forcing = _basis_and_forcing(source)
+    rates = (non_negative_parameter("diffusivity", diffusivity) * basis.wavenumbers**2
+             + non_negative_parameter("decay", decay))
+    return _model(source, lambda x, u, t: forcing(u) - rates * x, basis.names, sensors, noise, initial,
+                  initial_time=initial_time, output_names=output_names, units=units)
+
+
+def wave(source: Source, speed: ArrayLike, damping: ArrayLike, *, sensors: Sensors, noise: Any,
+         initial: Gaussian | None = None, initial_time: Any = None, output_names: Sequence[str] | None = None,
+         units: Mapping[str, str] | None = None) -> LatentForceModel:
+    r"""Return the wave equation with an unknown source, ``x_tt = speed^2 laplacian x - damping x_t + s(r, t)``.
+
+    The states are the coefficients of the basis, "mode 0", "mode 1", ..., and then their rates of change, "rate of
+    mode 0", ...; the forces are those of the source.
+
+    Args:
+        source: the space-time process s, in units of x per time^2; a basis alone: no source.
+        speed: in length/time; zero or above.
+        damping: in 1/time; zero or above.
+        sensors: as of `heat`.
+        noise: as of `heat`.
+        initial: distribution of the coefficients and their rates (2 J,) at the initial time; None: zero.
+        initial_time: as of `heat`.
+        output_names: as of `heat`.
+        units: as of `heat`.
+
+    Raises:
+        TypeError, ValueError: as of `heat`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import numpy as np
+        >>> import lfm_ppl as lfm
+        >>> string = lfm.LaplaceBasis((0.0, 1.0), 8)
+        >>> plucked = jnp.concatenate([string.coefficients(lambda r: np.sin(np.pi * r)), jnp.zeros(8)])
+        >>> start = lfm.Gaussian(plucked, jnp.zeros(16))
+        >>> lfm.wave(string, 1.0, 0.1, sensors=np.array([0.5]), noise=0.01, initial=start).state_names[8]
+        'rate of mode 0'
+
+    Source: Courant and Hilbert (1953), Methods of Mathematical Physics I, chapter V.
+    """
+    basis, forcing = _basis_and_forcing(source)
+    stiffness = (non_negative_parameter("speed", speed) * basis.wavenumbers)**2
+    friction, size = non_negative_parameter("damping", damping), len(basis.names)
+
+    def dynamics(x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
+        return jnp.concatenate([x[size:], forcing(u) - stiffness * x[:size] - friction * x[size:]])
+
+    names = (*basis.names, *(f"rate of {name}" for name in basis.names))
+    return _model(source, dynamics, names, sensors, noise, initial, initial_time=initial_time,
+                  output_names=output_names, units=units)
+
+
+def _basis_and_forcing(source: Any) -> tuple[LaplaceBasis, Callable[[jax.Array], Any]]:
+    """Return the basis, and the function from the forces u to the coefficients of the source."""
+    if isinstance(source, SpectralField):
+        amplitudes = source.amplitudes
+        return source.basis, lambda u: amplitudes * u
+    if not isinstance(source, LaplaceBasis):
+        raise TypeError("source must be an lfm.SpectralField, or an lfm.LaplaceBasis for none, got "
+                        f"{type(source).__name__}.")
+    return source, lambda u: 0.0
+
+
+def _model(source: Source, dynamics: Callable, state_names: Sequence[str], sensors: Sensors, noise: Any,
+           initial: Gaussian | None, **options: Any) -> LatentForceModel:
+    """Return the model of coefficients, the first J of which are those of the observed field."""
+    basis = source if isinstance(source, LaplaceBasis) else source.basis
+    places = sensors if callable(sensors) else None
+    functions = None if callable(sensors) else basis.functions(sensors)
+
+    def readings(x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
+        matrix = basis.functions(places(t)) if functions is None else functions  # type: ignore[misc]
+        return matrix @ x[:len(basis.names)]
+
+    size = len(state_names)
+    outputs = jax.eval_shape(readings, jnp.zeros(size), jnp.zeros(0), jnp.zeros(())).shape[0]
+    if initial is not None and initial.mean.shape != (size,):
+        raise ValueError(f"initial must be a distribution of {size} coefficients, got {initial.mean.shape[0]}.")
+    if options["output_names"] is None:
+        options["output_names"] = [f"sensor {index}" for index in range(outputs)]
+    if not callable(noise) and np.ndim(noise) == 0:
+        checks.positive("noise", noise)
+        noise = noise * jnp.ones(outputs)
+    return LatentForceModel(
+        dynamics, source.forces if isinstance(source, SpectralField) else {}, GaussianObservation(readings, noise),
+        Gaussian(jnp.zeros(size), jnp.zeros(size)) if initial is None else initial, state_names=state_names, **options)
