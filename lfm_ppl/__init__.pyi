@@ -68,10 +68,12 @@ from .results.accuracy import check_accuracy as check_accuracy
 from .results.arviz_data import load as load
 from .results.arviz_data import save as save
 from .results.correction import correct_posterior as correct_posterior
+from .results.fields import evaluate_field as evaluate_field
 from .results.html_report import save_report as save_report
 from .results.plots import plot_accuracy as plot_accuracy
 from .results.plots import plot_calibration as plot_calibration
 from .results.plots import plot_deterministics as plot_deterministics
+from .results.plots import plot_field as plot_field
 from .results.plots import plot_fit as plot_fit
 from .results.plots import plot_forces as plot_forces
 from .results.plots import plot_inputs as plot_inputs

@@ -1,0 +1,121 @@
+"""The posterior of a field in space and time, from the trajectories of a result.
+
+A field is a sum of states or forces with weights that depend on the place. The weights may depend on parameters, such
+as a lengthscale in space; they are then computed for each draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lfm_ppl.results.arviz_data import add_group, group, has_group
+
+GROUP = "field_"
+"""Prefix of the names of groups that hold stored fields."""
+
+_PLACES = {1: 60, 2: 30}
+"""Number of places along each edge where none are wanted."""
+
+
+def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any = None, name: str = "field",
+                   unit: str = "", length_unit: str = "") -> xr.Dataset:
+    """Return the posterior of a field at places, at the times of the trajectories.
+
+    Args:
+        result: of `lfm_ppl.fit`, of one series, with the group trajectories.
+        field: what the model was made with: a `LaplaceBasis` (the solution of `heat` or `wave`), a `SpectralField` or a
+            `SeparableField`; or a function from the parameters, name -> value, to it.
+        points: (P,) or (P, d); None: a grid over the domain of the field.
+        sensors: their places (D,) or (D, d), or a function of time that returns them, for figures.
+        name: of the field, for figures.
+        unit: of the field.
+        length_unit: unit of length.
+
+    Returns:
+        Variables ``draws`` (chain, draw, at, place) given the states and forces; ``mean`` and ``sd`` (at, place), the
+        sd with the variance beyond the forces of a `SeparableField`; ``truth`` (at, place) where it is known. The
+        places are ``r`` (place, axis).
+
+    Raises:
+        ValueError: the result has no trajectories of the states or forces of the field.
+
+    Example:
+        >>> import lfm_ppl as lfm
+        >>> from lfm_ppl.results.arviz_data import build
+        >>> states = (("chain", "draw", "at", "state"), np.ones((2, 5, 4, 1)))
+        >>> named = {"at": np.arange(4.0), "draw": np.arange(5), "state": ["mode 0"]}
+        >>> posterior = xr.Dataset({"decay": (("chain", "draw"), np.ones((2, 5)))}, {"draw": np.arange(5)})
+        >>> result = build({"trajectories": xr.Dataset({"states": states}, named), "posterior": posterior})
+        >>> evaluate_field(result, lfm.LaplaceBasis((0.0, 1.0), 1), [0.5])["mean"].values[0].round(4).tolist()
+        [1.4142]
+    """
+    import jax  # figures of a stored field need no JAX
+
+    trajectories = group(result, "trajectories")
+    parameters = {str(name): np.asarray(variable.transpose("chain", "draw", ...).values).reshape(
+        -1, *variable.shape[2:]) for name, variable in group(result, "posterior").sel(
+            draw=trajectories["draw"]).data_vars.items()}
+    make = _constant(field) if hasattr(field, "weights") else field
+    example = make({name: values[0] for name, values in parameters.items()})
+    places = np.asarray(_grid(example.domain) if points is None else points, float)
+
+    def weights_at(values: Mapping[str, Any]) -> tuple[Any, Any]:
+        weights, variance = make(values).weights(places)
+        return jax.numpy.asarray(weights), jax.numpy.asarray(variance)
+
+    weights, variance = jax.vmap(weights_at)(parameters)
+    stored = _coefficients(trajectories, example.names).drop_duplicates("at").transpose("chain", "draw", "at", ...)
+    values, times = stored.values, stored["at"].values
+    draws = values.reshape(-1, *values.shape[2:]) @ np.asarray(weights).swapaxes(1, 2)
+    along = ("at", "place")
+    variables = {"draws": (("chain", "draw", *along), draws.reshape(*values.shape[:2], *draws.shape[1:])),
+                 "mean": (along, draws.mean(0)),
+                 "sd": (along, np.sqrt(draws.var(0) + np.asarray(variance).mean(0)))}
+    if (truth := _truth(result, make, places, times)) is not None:
+        variables["truth"] = (along, truth)
+    if sensors is not None:
+        at = np.stack([np.asarray(sensors(time) if callable(sensors) else sensors, float) for time in times])
+        variables["sensors"] = (("at", "sensor", "axis"), at.reshape(*at.shape[:2], -1))
+    coords = {"at": stored["at"], "r": (("place", "axis"), places.reshape(len(places), -1))}
+    return xr.Dataset(variables, coords, {"name": name, "unit": unit, "length_unit": length_unit})
+
+
+def add_fields(result: Any, fields: Mapping[str, Mapping[str, Any]]) -> None:
+    """Store fields in a result that has trajectories: name -> keyword arguments of `evaluate_field`."""
+    for name, arguments in fields.items() if has_group(result, "trajectories") else ():
+        add_group(result, f"{GROUP}{name}", evaluate_field(result, name=name, **arguments).drop_vars("draws"))
+
+
+def _constant(field: Any) -> Callable[[Any], Any]:
+    return lambda parameters: field
+
+
+def _coefficients(dataset: xr.Dataset, names: tuple[str, ...]) -> xr.DataArray:
+    """Return the states or forces of these names from a group with trajectories."""
+    for kind in ("state", "force"):
+        if f"{kind}s" in dataset and set(names) <= set(map(str, dataset[kind].values)):
+            return dataset[f"{kind}s"].sel({kind: list(names)})
+    raise ValueError(f"the result has no trajectories of the states or forces {names[0]!r}, ..., {names[-1]!r} of the "
+                     "field. Was its model made with this field?")
+
+
+def _truth(result: Any, make: Callable[[Any], Any], places: np.ndarray, times: np.ndarray) -> np.ndarray | None:
+    """Return the true field (K, P) where its coefficients and parameters are known."""
+    try:
+        truth = group(result, "truth")
+        field = make({str(name): variable.values for name, variable in truth.data_vars.items()})
+        paths = _coefficients(truth, field.names)
+    except (KeyError, ValueError):
+        return None
+    paths = paths.drop_duplicates("at_truth").interp(at_truth=times).transpose("at_truth", ...)
+    return paths.values @ np.asarray(field.weights(places)[0]).T
+
+
+def _grid(domain: Any) -> np.ndarray:
+    axes = [np.linspace(low, high, _PLACES.get(len(domain), 10)) for low, high in domain]
+    places = np.stack([grid.ravel() for grid in np.meshgrid(*axes, indexing="ij")], axis=1)
+    return places[:, 0] if len(domain) == 1 else places
