@@ -1,15 +1,4 @@
-r"""Eigenfunctions of the Laplacian on an interval or a rectangle.
-
-With x the distance from the lower end of an edge of length L, the orthonormal functions of one dimension are
-
-    dirichlet:  sqrt(2 / L) sin(w x),                            w = n pi / L,    n = 1, 2, ...
-    neumann:    sqrt(1 / L), sqrt(2 / L) cos(w x),               w = n pi / L,    n = 0, 1, ...
-    periodic:   sqrt(1 / L), sqrt(2 / L) cos(w x) and sin(w x),  w = 2 n pi / L,  n = 0, 1, ...
-
-Those of a rectangle are their products, with the squared wavenumber w_1^2 + w_2^2.
-
-Source: Courant and Hilbert (1953), Methods of Mathematical Physics I, chapter V.
-"""
+"""Eigenfunctions of the Laplacian on an interval or a rectangle."""
 
 from __future__ import annotations
 
@@ -26,18 +15,22 @@ from scipy.special import roots_legendre
 
 from lfm_ppl.utils import checks
 
-BOUNDARIES = ("dirichlet", "neumann", "periodic")
-
 
 class LaplaceBasis(eqx.Module):
     r"""The leading eigenfunctions of the Laplacian, ``-laplacian phi_j = w_j^2 phi_j``, orthonormal on a domain.
 
-    A field is expanded as ``x(r, t) = sum_j c_j(t) phi_j(r)``. The functions are in the order of their wavenumbers.
+    A field is expanded as ``x(r, t) = sum_j c_j(t) phi_j(r)``. With x the distance from the lower end of an interval of
+    length L, and n = 0, 1, ... (1, 2, ... for sines), the functions are
+
+        dirichlet:  sqrt(2 / L) sin(w x),                            w = n pi / L,
+        neumann:    sqrt(1 / L), sqrt(2 / L) cos(w x),               w = n pi / L,
+        periodic:   sqrt(1 / L), sqrt(2 / L) cos(w x) and sin(w x),  w = 2 n pi / L,
+
+    and their products for a rectangle, with the squared wavenumber ``w_1^2 + w_2^2``, in the order of wavenumbers.
 
     Args:
         domain: (low, high), or ((low, high), (low, high)) for a rectangle, in units of length.
-        modes: number of functions, or a pair for a rectangle; periodic edges need odd numbers: a constant and pairs of
-            cosine and sine.
+        modes: number of functions, or a pair for a rectangle; odd for periodic edges: a constant, and pairs.
         boundary: "dirichlet" (the field is zero at the edges), "neumann" (no flux through them) or "periodic".
 
     Raises:
@@ -57,17 +50,15 @@ class LaplaceBasis(eqx.Module):
     boundary: str = eqx.field(static=True)
 
     def __init__(self, domain: Any, modes: int | Sequence[int], boundary: str = "dirichlet"):
-        edges = checks.concrete(domain)
-        if edges is None or edges.shape not in ((2,), (1, 2), (2, 2)) or not (np.diff(edges) > 0).all():
+        edges = np.asarray(domain, float)
+        if edges.shape not in ((2,), (1, 2), (2, 2)) or not (np.isfinite(edges).all() and (np.diff(edges) > 0).all()):
             raise ValueError("domain must be (low, high), or two such pairs for a rectangle, with low < high; got "
                              f"{domain!r}.")
-        checks.finite("domain", edges)
         self.domain = tuple((float(low), float(high)) for low, high in np.atleast_2d(edges))
         self.modes = tuple(modes) if isinstance(modes, Sequence) else (modes,)
         if len(self.modes) != len(self.domain):
-            raise ValueError("modes must hold a number for each dimension of the domain, "
-                             f"{len(self.domain)}; got {modes!r}.")
-        checks.one_of("boundary", boundary, BOUNDARIES)
+            raise ValueError(f"modes must hold a number for each dimension, {len(self.domain)}; got {modes!r}.")
+        checks.one_of("boundary", boundary, ("dirichlet", "neumann", "periodic"))
         for count in self.modes:
             checks.positive_integer("modes", count)
             if boundary == "periodic" and count % 2 == 0:
@@ -77,12 +68,12 @@ class LaplaceBasis(eqx.Module):
     @property
     def wavenumbers(self) -> np.ndarray:
         """The wavenumbers w_j (J,), in 1/length."""
-        return _ordered(self)[1]
+        return np.sqrt((_orders_and_wavenumbers(self)[1]**2).sum(1))
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the coefficients of a field among the states of a model: "mode 0", "mode 1", ..."""
-        return tuple(f"mode {index}" for index in range(len(self.wavenumbers)))
+        return tuple(f"mode {index}" for index in range(np.prod(self.modes)))
 
     def functions(self, points: ArrayLike) -> Any:
         """Return phi_j (P, J) at places (P,) or (P, d).
@@ -90,18 +81,16 @@ class LaplaceBasis(eqx.Module):
         Raises:
             ValueError: a place lies outside of the domain. Inside of compiled code there is no check.
         """
-        places = place_array("points", points, len(self.domain))
+        places, (low, high) = place_array(points, len(self.domain)), np.transpose(self.domain)
         xp = jnp if checks.traced(places) else np
-        if xp is np:
-            self._check_inside(places)
-        value: Any = 1.0
-        for axis, (low, high) in enumerate(self.domain):
-            orders = _ordered(self)[0][:, axis]
-            angle = _wavenumber(self.boundary, orders, high - low) * (places[:, axis, None] - low)
-            is_sine = (orders > 0) & (orders % 2 == 0 if self.boundary == "periodic" else self.boundary == "dirichlet")
-            amplitude = np.sqrt(np.where(orders == 0, 1.0, 2.0) / (high - low))
-            value = value * amplitude * xp.where(is_sine, xp.sin(angle), xp.cos(angle))
-        return value
+        if xp is np and (outside := (np.abs(places - 0.5 * (low + high)) > 0.5000001 * (high - low)).any(1)).any():
+            raise ValueError(f"points[{outside.argmax()}] = {places[outside.argmax()].tolist()} lies outside of the "
+                             f"domain {self.domain}.")
+        orders, wavenumbers = _orders_and_wavenumbers(self)
+        angles = wavenumbers * (places - low)[:, None, :]
+        is_sine = (orders > 0) & (orders % 2 == 0 if self.boundary == "periodic" else self.boundary == "dirichlet")
+        amplitudes = np.sqrt(np.where(orders == 0, 1.0, 2.0) / (high - low))
+        return (amplitudes * xp.where(is_sine, xp.sin(angles), xp.cos(angles))).prod(-1)
 
     def weights(self, points: ArrayLike) -> tuple[Any, Any]:
         """Return the weights (P, J) of the coefficients in the field at places, and the variance beyond them, zero."""
@@ -117,46 +106,33 @@ class LaplaceBasis(eqx.Module):
             ValueError: the function returns values of another shape.
         """
         nodes, weights = zip(*(roots_legendre(4 * count + 100) for count in self.modes), strict=True)
-        scaled = [low + 0.5 * (high - low) * (x + 1.0) for (low, high), x in zip(self.domain, nodes, strict=True)]
-        points = np.stack([grid.ravel() for grid in np.meshgrid(*scaled, indexing="ij")], axis=1)
-        weight = functools.reduce(np.multiply.outer, weights).ravel() * np.prod(0.5 * np.diff(self.domain))
+        low, high = np.transpose(self.domain)
+        points = np.stack([grid.ravel() for grid in np.meshgrid(*nodes, indexing="ij")], axis=1)
+        points = low + 0.5 * (high - low) * (points + 1.0)
+        weight = functools.reduce(np.multiply.outer, weights).ravel() * np.prod(0.5 * (high - low))
         values = jnp.asarray(function(points[:, 0] if len(self.domain) == 1 else points))
         if values.shape != weight.shape:
-            raise ValueError(f"function must return one value for each place, shape {weight.shape}; it returned shape "
-                             f"{values.shape}.")
+            raise ValueError(f"function must return a value for each place, shape {weight.shape}; got {values.shape}.")
         return jnp.asarray(self.functions(points).T * weight) @ values
 
-    def _check_inside(self, places: np.ndarray) -> None:
-        checks.finite("points", places)
-        low, high = np.transpose(self.domain)
-        rounding = 1e-9 * (high - low)
-        outside = ((places < low - rounding) | (places > high + rounding)).any(axis=1)
-        if outside.any():
-            raise ValueError(f"points[{outside.argmax()}] = {places[outside.argmax()].tolist()} lies outside of the "
-                             f"domain {self.domain}.")
 
-
-def place_array(name: str, points: ArrayLike, dimension: int | None = None) -> Any:
+def place_array(points: ArrayLike, dimension: int | None = None) -> Any:
     """Return places (P,) or (P, d) as an array (P, d); ``dimension`` None: any number of dimensions."""
     places: Any = points if checks.traced(points) else np.asarray(points, float)
     places = places[:, None] if places.ndim == 1 else places
     if places.ndim != 2 or places.shape[0] == 0 or places.shape[1] != (dimension or places.shape[1]):
-        form = {None: "(P,) or (P, d)", 1: "(P,)"}.get(dimension, f"(P, {dimension})")
-        raise ValueError(f"{name} must be an array of places {form}, got shape {np.shape(points)}.")
+        raise ValueError(f"points must be an array of places (P, {dimension or 'd'}), got shape {np.shape(points)}.")
+    checks.finite("points", places)
     return places
 
 
-def _wavenumber(boundary: str, orders: np.ndarray, length: float) -> np.ndarray:
-    return np.pi / length * (2.0 * np.ceil(orders / 2) if boundary == "periodic" else orders)
-
-
 @functools.lru_cache(maxsize=64)
-def _ordered(basis: LaplaceBasis) -> tuple[np.ndarray, np.ndarray]:
-    """Return the orders n (J, d) of the functions in each dimension, and the wavenumbers (J,)."""
+def _orders_and_wavenumbers(basis: LaplaceBasis) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of the functions (J, d) in each dimension, sines and cosines counted, and wavenumbers."""
     first = int(basis.boundary == "dirichlet")
     grids = np.meshgrid(*(np.arange(first, first + count) for count in basis.modes), indexing="ij")
     orders = np.stack([grid.ravel() for grid in grids], axis=1)
-    squares = np.sum([_wavenumber(basis.boundary, orders[:, axis], high - low)**2
-                      for axis, (low, high) in enumerate(basis.domain)], axis=0)
-    ranks = np.argsort(squares, kind="stable")
-    return orders[ranks], np.sqrt(squares[ranks])
+    waves = 2 * np.ceil(orders / 2) if basis.boundary == "periodic" else orders
+    wavenumbers = np.pi * waves / np.diff(basis.domain)[:, 0]
+    ranks = np.argsort((wavenumbers**2).sum(1), kind="stable")
+    return orders[ranks], wavenumbers[ranks]

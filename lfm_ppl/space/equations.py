@@ -1,22 +1,16 @@
 r"""The heat and the wave equation with an unknown source, as latent force models of their eigenfunctions.
 
-1. The field is expanded in the eigenfunctions of the Laplacian, ``x(r, t) = sum_j c_j(t) phi_j(r)``, and so is its
-   source, a `SpectralField` with forces u_j.
-2. Every coefficient has an ordinary differential equation of its own,
-
-       heat:  c_j' = -(diffusivity w_j^2 + decay) c_j + sqrt(S(w_j)) u_j,
-       wave:  c_j'' = -speed^2 w_j^2 c_j - damping c_j' + sqrt(S(w_j)) u_j.
-
-3. Sensors observe the field at places, which is linear in the coefficients. The model is linear and time-invariant, so
+1. The field is expanded in eigenfunctions of the Laplacian, ``x(r, t) = sum_j c_j(t) phi_j(r)``, and so is its source,
+   a `SpectralField` with forces u_j. Every coefficient has an ordinary differential equation of its own.
+2. Sensors observe the field at places, which is linear in the coefficients. The model is linear and time-invariant, so
    that filter, smoother and likelihood are exact for these modes.
 
-Source: Särkkä, Álvarez and Lawrence (2019), IEEE Transactions on Automatic Control 64, section V; Hartikainen (2013),
-doctoral thesis, section 3.3.
+Source: Särkkä, Álvarez and Lawrence (2019), IEEE Transactions on Automatic Control 64, section V.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -37,11 +31,12 @@ Sensors = ArrayLike | Callable[[jax.Array], jax.Array]
 
 
 def heat(source: Source, diffusivity: ArrayLike, decay: ArrayLike, *, sensors: Sensors, noise: Any,
-         initial: Gaussian | None = None, initial_time: Any = None, output_names: Sequence[str] | None = None,
-         units: Mapping[str, str] | None = None) -> LatentForceModel:
+         initial: Gaussian | None = None, **options: Any) -> LatentForceModel:
     r"""Return the heat equation with an unknown source, ``x_t = diffusivity laplacian x - decay x + s(r, t)``.
 
-    The states are the coefficients of the basis, "mode 0", "mode 1", ...; the forces are those of the source.
+    The states are the coefficients of the basis, "mode 0", "mode 1", ...; the forces are those of the source:
+
+        c_j' = -(diffusivity w_j^2 + decay) c_j + sqrt(S(w_j)) u_j.
 
     Args:
         source: the space-time process s, in units of x per time; a basis alone: no source.
@@ -51,9 +46,7 @@ def heat(source: Source, diffusivity: ArrayLike, decay: ArrayLike, *, sensors: S
         noise: variance of the measurements, or any covariance of `GaussianObservation`.
         initial: distribution of the coefficients (J,) at the initial time, see `LaplaceBasis.coefficients`; None: the
             field is zero.
-        initial_time: time of the initial field; None: the first time of the data.
-        output_names: of the D sensors.
-        units: as of `LatentForceModel`.
+        **options: ``initial_time``, ``output_names``, ``units`` and others of `LatentForceModel`.
 
     Raises:
         TypeError: the source is neither a field nor a basis.
@@ -73,17 +66,17 @@ def heat(source: Source, diffusivity: ArrayLike, decay: ArrayLike, *, sensors: S
     basis, forcing = _basis_and_forcing(source)
     rates = (non_negative_parameter("diffusivity", diffusivity) * basis.wavenumbers**2
              + non_negative_parameter("decay", decay))
-    return _model(source, lambda x, u, t: forcing(u) - rates * x, basis.names, sensors, noise, initial,
-                  initial_time=initial_time, output_names=output_names, units=units)
+    return _model(source, lambda x, u, t: forcing(u) - rates * x, basis.names, sensors, noise, initial, options)
 
 
 def wave(source: Source, speed: ArrayLike, damping: ArrayLike, *, sensors: Sensors, noise: Any,
-         initial: Gaussian | None = None, initial_time: Any = None, output_names: Sequence[str] | None = None,
-         units: Mapping[str, str] | None = None) -> LatentForceModel:
+         initial: Gaussian | None = None, **options: Any) -> LatentForceModel:
     r"""Return the wave equation with an unknown source, ``x_tt = speed^2 laplacian x - damping x_t + s(r, t)``.
 
     The states are the coefficients of the basis, "mode 0", "mode 1", ..., and then their rates of change, "rate of
-    mode 0", ...; the forces are those of the source.
+    mode 0", ...; the forces are those of the source:
+
+        c_j'' = -speed^2 w_j^2 c_j - damping c_j' + sqrt(S(w_j)) u_j.
 
     Args:
         source: the space-time process s, in units of x per time^2; a basis alone: no source.
@@ -92,21 +85,16 @@ def wave(source: Source, speed: ArrayLike, damping: ArrayLike, *, sensors: Senso
         sensors: as of `heat`.
         noise: as of `heat`.
         initial: distribution of the coefficients and their rates (2 J,) at the initial time; None: zero.
-        initial_time: as of `heat`.
-        output_names: as of `heat`.
-        units: as of `heat`.
+        **options: as of `heat`.
 
     Raises:
         TypeError, ValueError: as of `heat`.
 
     Example:
-        >>> import jax.numpy as jnp
         >>> import numpy as np
         >>> import lfm_ppl as lfm
-        >>> string = lfm.LaplaceBasis((0.0, 1.0), 8)
-        >>> plucked = jnp.concatenate([string.coefficients(lambda r: np.sin(np.pi * r)), jnp.zeros(8)])
-        >>> start = lfm.Gaussian(plucked, jnp.zeros(16))
-        >>> lfm.wave(string, 1.0, 0.1, sensors=np.array([0.5]), noise=0.01, initial=start).state_names[8]
+        >>> model = lfm.wave(lfm.LaplaceBasis((0.0, 1.0), 8), 1.0, 0.1, sensors=np.array([0.5]), noise=0.01)
+        >>> model.state_names[8]
         'rate of mode 0'
 
     Source: Courant and Hilbert (1953), Methods of Mathematical Physics I, chapter V.
@@ -119,8 +107,7 @@ def wave(source: Source, speed: ArrayLike, damping: ArrayLike, *, sensors: Senso
         return jnp.concatenate([x[size:], forcing(u) - stiffness * x[:size] - friction * x[size:]])
 
     names = (*basis.names, *(f"rate of {name}" for name in basis.names))
-    return _model(source, dynamics, names, sensors, noise, initial, initial_time=initial_time,
-                  output_names=output_names, units=units)
+    return _model(source, dynamics, names, sensors, noise, initial, options)
 
 
 def _basis_and_forcing(source: Any) -> tuple[LaplaceBasis, Callable[[jax.Array], Any]]:
@@ -134,26 +121,23 @@ def _basis_and_forcing(source: Any) -> tuple[LaplaceBasis, Callable[[jax.Array],
     return source, lambda u: 0.0
 
 
-def _model(source: Source, dynamics: Callable, state_names: Sequence[str], sensors: Sensors, noise: Any,
-           initial: Gaussian | None, **options: Any) -> LatentForceModel:
+def _model(source: Source, dynamics: Callable, state_names: Sequence[str], sensors: Any, noise: Any,
+           initial: Gaussian | None, options: dict[str, Any]) -> LatentForceModel:
     """Return the model of coefficients, the first J of which are those of the observed field."""
-    basis = source if isinstance(source, LaplaceBasis) else source.basis
-    places = sensors if callable(sensors) else None
+    basis, size = source if isinstance(source, LaplaceBasis) else source.basis, len(state_names)
     functions = None if callable(sensors) else basis.functions(sensors)
 
     def readings(x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
-        matrix = basis.functions(places(t)) if functions is None else functions  # type: ignore[misc]
+        matrix = basis.functions(sensors(t)) if functions is None else functions
         return matrix @ x[:len(basis.names)]
 
-    size = len(state_names)
     outputs = jax.eval_shape(readings, jnp.zeros(size), jnp.zeros(0), jnp.zeros(())).shape[0]
     if initial is not None and initial.mean.shape != (size,):
         raise ValueError(f"initial must be a distribution of {size} coefficients, got {initial.mean.shape[0]}.")
-    if options["output_names"] is None:
-        options["output_names"] = [f"sensor {index}" for index in range(outputs)]
     if not callable(noise) and np.ndim(noise) == 0:
         checks.positive("noise", noise)
         noise = noise * jnp.ones(outputs)
+    options = {"output_names": [f"sensor {index}" for index in range(outputs)], **options}
     return LatentForceModel(
         dynamics, source.forces if isinstance(source, SpectralField) else {}, GaussianObservation(readings, noise),
         Gaussian(jnp.zeros(size), jnp.zeros(size)) if initial is None else initial, state_names=state_names, **options)

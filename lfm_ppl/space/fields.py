@@ -8,7 +8,6 @@ The covariance of a field u(r, t) is the product of an isotropic kernel in space
    Cholesky's method with complete pivoting, which may stop at a rank below N.
 3. It predicts at other places given the pivots P: the weights are ``K(r, P) L_P^-T``, and the variance that they do not
    explain is added.
-4. Both report the share of the variance that they leave out, and warn where it is large.
 
 Sources: Solin and Särkkä (2020), Hilbert space methods for reduced-rank Gaussian process regression, Statistics and
 Computing 30; Hartikainen (2013), doctoral thesis, section 3.3; Harbrecht, Peters and Schneider (2012), On the low-rank
@@ -31,7 +30,7 @@ from lfm_ppl.forces.sde import ApproximationWarning, Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.space.eigenfunctions import LaplaceBasis, place_array
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import pivoted_cholesky, solve_lower
+from lfm_ppl.utils.linalg import pivoted_cholesky, safe_sqrt, solve_lower
 
 _LARGEST_LOSS = 0.05
 """Share of the variance left out above which there is a warning."""
@@ -60,13 +59,7 @@ class SpaceTimeField(eqx.Module):
         for argument, process in (("spatial_kernel", spatial_kernel), ("temporal_force", temporal_force)):
             if callable(process.mean) or (checks.concrete(process.mean) or 0.0) != 0.0:
                 raise ValueError(f"{argument} must have mean zero; add a mean to the dynamics or the observation.")
-        self.spatial_kernel, self.temporal_force = spatial_kernel, temporal_force
-        self.rank, self.name = rank, name
-
-    @property
-    def lost_variance(self) -> jax.Array:
-        """Share of the variance of the field that its forces leave out, on average over the domain or the points."""
-        raise NotImplementedError
+        self.spatial_kernel, self.temporal_force, self.rank, self.name = spatial_kernel, temporal_force, rank, name
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -78,8 +71,8 @@ class SpaceTimeField(eqx.Module):
         """The forces v_j by name."""
         return dict.fromkeys(self.names, self.temporal_force)
 
-    def _warn_of_lost_variance(self, remedy: str) -> None:
-        lost = None if checks.traced(self) else checks.concrete(self.lost_variance)
+    def _warn_of(self, lost_variance: jax.Array, remedy: str) -> None:
+        lost = checks.concrete(lost_variance)
         if lost is not None and lost > _LARGEST_LOSS:
             checks.warn(f"the {self.rank} forces of the field {self.name!r} leave out {100 * float(lost):.0f}% of its "
                         f"variance. Use {remedy}.", ApproximationWarning)
@@ -121,9 +114,10 @@ class SpectralField(SpaceTimeField):
     def __init__(self, basis: LaplaceBasis, spatial_kernel: Kernel, temporal_force: Force, name: str = "source"):
         if not isinstance(basis, LaplaceBasis):
             raise TypeError(f"basis must be an lfm.LaplaceBasis, got {type(basis).__name__}.")
-        self._set(spatial_kernel, temporal_force, len(basis.wavenumbers), name)
+        self._set(spatial_kernel, temporal_force, len(basis.names), name)
         self.basis = basis
-        self._warn_of_lost_variance("more modes")
+        if not checks.traced(self):
+            self._warn_of(self.lost_variance, "more modes")
 
     @property
     def domain(self) -> tuple[tuple[float, float], ...]:
@@ -178,8 +172,7 @@ class SeparableField(SpaceTimeField):
         >>> len(field.forces), field(np.zeros(6)).shape, bool(field.lost_variance < 1e-4)
         (6, (30,), True)
 
-    Source: Hartikainen (2013), doctoral thesis, section 3.3; Harbrecht, Peters and Schneider (2012), Applied Numerical
-    Mathematics 62.
+    Source: Hartikainen (2013), doctoral thesis, section 3.3; Harbrecht, Peters and Schneider (2012).
     """
 
     points: np.ndarray
@@ -188,17 +181,16 @@ class SeparableField(SpaceTimeField):
 
     def __init__(self, points: ArrayLike, spatial_kernel: Kernel, temporal_force: Force, rank: int | None = None,
                  name: str = "field"):
-        checks.finite("points", points)
-        self.points = place_array("points", points)
+        self.points = place_array(points)
         rank = len(self.points) if rank is None else rank
-        self._set(spatial_kernel, temporal_force, rank, name)
-        if not temporal_force.stationary:
-            raise ValueError(f"temporal_force must be stationary, got {type(temporal_force).__name__}.")
         checks.positive_integer("rank", rank)
         if rank > len(self.points):
             raise ValueError(f"rank must be at most the number of points, {len(self.points)}; got {rank}.")
+        self._set(spatial_kernel, temporal_force, rank, name)
+        if not temporal_force.stationary:
+            raise ValueError(f"temporal_force must be stationary, got {type(temporal_force).__name__}.")
         self.root, self.pivots = pivoted_cholesky(self._covariance(self.points, self.points), rank)
-        self._warn_of_lost_variance("a higher rank")
+        self._warn_of(self.lost_variance, "a higher rank")
 
     @property
     def domain(self) -> tuple[tuple[float, float], ...]:
@@ -221,18 +213,14 @@ class SeparableField(SpaceTimeField):
 
         Given the forces, the field at a place is normal, with the mean ``weights @ v`` and this variance (P,).
         """
-        places = place_array("points", points, self.points.shape[1])
+        places = place_array(points, self.points.shape[1])
         cross = self._covariance(jnp.asarray(self.points)[self.pivots], places)
         weights = solve_lower(self.root[self.pivots], cross).T
         residual = jnp.maximum(self.spatial_kernel.scale**2 - (weights**2).sum(1), 0.0)
         return weights, residual * self.temporal_force.covariance(0.0)
 
     def _covariance(self, first: Any, second: Any) -> jax.Array:
-        square = ((first[:, None, :] - second[None, :, :])**2).sum(-1)
-        # The derivative of the distance of a place to itself is zero here.
-        is_positive = square > 0
-        distance = jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, square, 1.0)), 0.0)
-        return self.spatial_kernel.covariance(distance)
+        return self.spatial_kernel.covariance(safe_sqrt(((first[:, None, :] - second[None, :, :])**2).sum(-1)))
 
 
 def _log_density(kernel: Kernel, basis: LaplaceBasis) -> jax.Array:
@@ -243,10 +231,9 @@ def _log_density(kernel: Kernel, basis: LaplaceBasis) -> jax.Array:
 
     Source: Rasmussen and Williams (2006), Gaussian Processes for Machine Learning, equations 4.11 and 4.15.
     """
-    dimension, square = len(basis.domain), basis.wavenumbers**2
-    half, scale, lengthscale = 0.5 * dimension, 2.0 * jnp.log(kernel.scale), kernel.lengthscale
+    half, square, scale = 0.5 * len(basis.domain), basis.wavenumbers**2, 2.0 * jnp.log(kernel.scale)
     if isinstance(kernel, SquaredExponential):
-        return scale + half * math.log(2 * math.pi) + dimension * jnp.log(lengthscale) - 0.5 * lengthscale**2 * square
-    nu, rate = kernel.order + 0.5, 2.0 * (kernel.order + 0.5) / lengthscale**2
+        return scale + half * jnp.log(2 * np.pi * kernel.lengthscale**2) - 0.5 * kernel.lengthscale**2 * square
+    nu, rate = kernel.order + 0.5, 2.0 * (kernel.order + 0.5) / kernel.lengthscale**2
     constant = half * math.log(4.0 * math.pi) + math.lgamma(nu + half) - math.lgamma(nu)
     return scale + constant + nu * jnp.log(rate) - (nu + half) * jnp.log(rate + square)
