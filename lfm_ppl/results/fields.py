@@ -17,9 +17,6 @@ from lfm_ppl.results.arviz_data import add_group, group, has_group
 GROUP = "field_"
 """Prefix of the names of groups that hold stored fields."""
 
-_PLACES = {1: 60, 2: 30}
-"""Number of places along each edge where none are wanted."""
-
 
 def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any = None, name: str = "field",
                    unit: str = "", length_unit: str = "") -> xr.Dataset:
@@ -56,30 +53,27 @@ def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any 
     import jax  # figures of a stored field need no JAX
 
     trajectories = group(result, "trajectories")
-    parameters = {str(name): np.asarray(variable.transpose("chain", "draw", ...).values).reshape(
-        -1, *variable.shape[2:]) for name, variable in group(result, "posterior").sel(
-            draw=trajectories["draw"]).data_vars.items()}
-    make = _constant(field) if hasattr(field, "weights") else field
-    example = make({name: values[0] for name, values in parameters.items()})
+    posterior = group(result, "posterior").sel(draw=trajectories["draw"]).transpose("chain", "draw", ...)
+    parameters = {str(label): variable.values.reshape(-1, *variable.shape[2:]) for label, variable in posterior.items()}
+
+    def make(values: Mapping[str, Any]) -> Any:
+        return field if hasattr(field, "weights") else field(values)
+
+    example = make({label: values[0] for label, values in parameters.items()})
     places = np.asarray(_grid(example.domain) if points is None else points, float)
-
-    def weights_at(values: Mapping[str, Any]) -> tuple[Any, Any]:
-        weights, variance = make(values).weights(places)
-        return jax.numpy.asarray(weights), jax.numpy.asarray(variance)
-
-    weights, variance = jax.vmap(weights_at)(parameters)
+    weights, variance = jax.jit(jax.vmap(
+        lambda values: jax.tree.map(jax.numpy.asarray, make(values).weights(places))))(parameters)
     stored = _coefficients(trajectories, example.names).drop_duplicates("at").transpose("chain", "draw", "at", ...)
-    values, times = stored.values, stored["at"].values
+    values, times, along = stored.values, stored["at"].values, ("at", "place")
     draws = values.reshape(-1, *values.shape[2:]) @ np.asarray(weights).swapaxes(1, 2)
-    along = ("at", "place")
     variables = {"draws": (("chain", "draw", *along), draws.reshape(*values.shape[:2], *draws.shape[1:])),
                  "mean": (along, draws.mean(0)),
                  "sd": (along, np.sqrt(draws.var(0) + np.asarray(variance).mean(0)))}
     if (truth := _truth(result, make, places, times)) is not None:
         variables["truth"] = (along, truth)
     if sensors is not None:
-        at = np.stack([np.asarray(sensors(time) if callable(sensors) else sensors, float) for time in times])
-        variables["sensors"] = (("at", "sensor", "axis"), at.reshape(*at.shape[:2], -1))
+        at_sensors = np.stack([np.asarray(sensors(t) if callable(sensors) else sensors, float) for t in times])
+        variables["sensors"] = (("at", "sensor", "axis"), at_sensors.reshape(*at_sensors.shape[:2], -1))
     coords = {"at": stored["at"], "r": (("place", "axis"), places.reshape(len(places), -1))}
     return xr.Dataset(variables, coords, {"name": name, "unit": unit, "length_unit": length_unit})
 
@@ -88,10 +82,6 @@ def add_fields(result: Any, fields: Mapping[str, Mapping[str, Any]]) -> None:
     """Store fields in a result that has trajectories: name -> keyword arguments of `evaluate_field`."""
     for name, arguments in fields.items() if has_group(result, "trajectories") else ():
         add_group(result, f"{GROUP}{name}", evaluate_field(result, name=name, **arguments).drop_vars("draws"))
-
-
-def _constant(field: Any) -> Callable[[Any], Any]:
-    return lambda parameters: field
 
 
 def _coefficients(dataset: xr.Dataset, names: tuple[str, ...]) -> xr.DataArray:
@@ -107,7 +97,7 @@ def _truth(result: Any, make: Callable[[Any], Any], places: np.ndarray, times: n
     """Return the true field (K, P) where its coefficients and parameters are known."""
     try:
         truth = group(result, "truth")
-        field = make({str(name): variable.values for name, variable in truth.data_vars.items()})
+        field = make({str(label): variable.values for label, variable in truth.items()})
         paths = _coefficients(truth, field.names)
     except (KeyError, ValueError):
         return None
@@ -116,6 +106,6 @@ def _truth(result: Any, make: Callable[[Any], Any], places: np.ndarray, times: n
 
 
 def _grid(domain: Any) -> np.ndarray:
-    axes = [np.linspace(low, high, _PLACES.get(len(domain), 10)) for low, high in domain]
+    axes = [np.linspace(low, high, 60 if len(domain) == 1 else 30) for low, high in domain]
     places = np.stack([grid.ravel() for grid in np.meshgrid(*axes, indexing="ij")], axis=1)
     return places[:, 0] if len(domain) == 1 else places
