@@ -1,12 +1,4 @@
-r"""The heat and the wave equation with an unknown source, as latent force models of their eigenfunctions.
-
-1. The field is expanded in eigenfunctions of the Laplacian, ``x(r, t) = sum_j c_j(t) phi_j(r)``, and so is its source,
-   a `SpectralField` with forces u_j. Every coefficient has an ordinary differential equation of its own.
-2. Sensors observe the field at places, which is linear in the coefficients. The model is linear and time-invariant, so
-   that filter, smoother and likelihood are exact for these modes.
-
-Source: Särkkä, Álvarez and Lawrence (2019), IEEE Transactions on Automatic Control 64, section V.
-"""
+"""The heat and the wave equation with an unknown source, as latent force models of their eigenfunctions."""
 
 from __future__ import annotations
 
@@ -26,17 +18,16 @@ from lfm_ppl.space.eigenfunctions import LaplaceBasis
 from lfm_ppl.space.fields import SpectralField
 from lfm_ppl.utils import checks
 
-Source = SpectralField | LaplaceBasis
-Sensors = ArrayLike | Callable[[jax.Array], jax.Array]
 
-
-def heat(source: Source, diffusivity: ArrayLike, decay: ArrayLike, *, sensors: Sensors, noise: Any,
+def heat(source: SpectralField | LaplaceBasis, diffusivity: ArrayLike, decay: ArrayLike, *, sensors: Any, noise: Any,
          initial: Gaussian | None = None, **options: Any) -> LatentForceModel:
     r"""Return the heat equation with an unknown source, ``x_t = diffusivity laplacian x - decay x + s(r, t)``.
 
-    The states are the coefficients of the basis, "mode 0", "mode 1", ...; the forces are those of the source:
+    The states are the coefficients of x in the basis, "mode 0", "mode 1", ...; the forces u_j are those of the source:
 
-        c_j' = -(diffusivity w_j^2 + decay) c_j + sqrt(S(w_j)) u_j.
+        c_j' = -(diffusivity w_j^2 + decay) c_j + sqrt(S(w_j)) u_j,    y_k = sum_j phi_j(r_k) c_j(t) + noise.
+
+    The model is linear and time-invariant, so that filter, smoother and likelihood are exact for these modes.
 
     Args:
         source: the space-time process s, in units of x per time; a basis alone: no source.
@@ -63,13 +54,13 @@ def heat(source: Source, diffusivity: ArrayLike, decay: ArrayLike, *, sensors: S
 
     Source: Särkkä, Álvarez and Lawrence (2019), IEEE Transactions on Automatic Control 64, section V.
     """
-    basis, forcing = _basis_and_forcing(source)
+    basis = _basis(source)
     rates = (non_negative_parameter("diffusivity", diffusivity) * basis.wavenumbers**2
              + non_negative_parameter("decay", decay))
-    return _model(source, lambda x, u, t: forcing(u) - rates * x, basis.names, sensors, noise, initial, options)
+    return _model(source, lambda x, s: s - rates * x, basis.names, sensors, noise, initial, options)
 
 
-def wave(source: Source, speed: ArrayLike, damping: ArrayLike, *, sensors: Sensors, noise: Any,
+def wave(source: SpectralField | LaplaceBasis, speed: ArrayLike, damping: ArrayLike, *, sensors: Any, noise: Any,
          initial: Gaussian | None = None, **options: Any) -> LatentForceModel:
     r"""Return the wave equation with an unknown source, ``x_tt = speed^2 laplacian x - damping x_t + s(r, t)``.
 
@@ -99,32 +90,29 @@ def wave(source: Source, speed: ArrayLike, damping: ArrayLike, *, sensors: Senso
 
     Source: Courant and Hilbert (1953), Methods of Mathematical Physics I, chapter V.
     """
-    basis, forcing = _basis_and_forcing(source)
+    basis = _basis(source)
     stiffness = (non_negative_parameter("speed", speed) * basis.wavenumbers)**2
     friction, size = non_negative_parameter("damping", damping), len(basis.names)
 
-    def dynamics(x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
-        return jnp.concatenate([x[size:], forcing(u) - stiffness * x[:size] - friction * x[size:]])
+    def equation(x: jax.Array, s: Any) -> jax.Array:
+        return jnp.concatenate([x[size:], s - stiffness * x[:size] - friction * x[size:]])
 
     names = (*basis.names, *(f"rate of {name}" for name in basis.names))
-    return _model(source, dynamics, names, sensors, noise, initial, options)
+    return _model(source, equation, names, sensors, noise, initial, options)
 
 
-def _basis_and_forcing(source: Any) -> tuple[LaplaceBasis, Callable[[jax.Array], Any]]:
-    """Return the basis, and the function from the forces u to the coefficients of the source."""
-    if isinstance(source, SpectralField):
-        amplitudes = source.amplitudes
-        return source.basis, lambda u: amplitudes * u
-    if not isinstance(source, LaplaceBasis):
+def _basis(source: Any) -> LaplaceBasis:
+    if not isinstance(source, SpectralField | LaplaceBasis):
         raise TypeError("source must be an lfm.SpectralField, or an lfm.LaplaceBasis for none, got "
                         f"{type(source).__name__}.")
-    return source, lambda u: 0.0
+    return source.basis if isinstance(source, SpectralField) else source
 
 
-def _model(source: Source, dynamics: Callable, state_names: Sequence[str], sensors: Any, noise: Any,
+def _model(source: Any, equation: Callable, state_names: Sequence[str], sensors: Any, noise: Any,
            initial: Gaussian | None, options: dict[str, Any]) -> LatentForceModel:
-    """Return the model of coefficients, the first J of which are those of the observed field."""
-    basis, size = source if isinstance(source, LaplaceBasis) else source.basis, len(state_names)
+    """Return the model of an equation, from coefficients x and those of the source to the rates of change of x."""
+    basis, size, has_source = _basis(source), len(state_names), isinstance(source, SpectralField)
+    amplitudes = source.amplitudes if has_source else 0.0
     functions = None if callable(sensors) else basis.functions(sensors)
 
     def readings(x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
@@ -138,6 +126,7 @@ def _model(source: Source, dynamics: Callable, state_names: Sequence[str], senso
         checks.positive("noise", noise)
         noise = noise * jnp.ones(outputs)
     options = {"output_names": [f"sensor {index}" for index in range(outputs)], **options}
+    initial = Gaussian(jnp.zeros(size), jnp.zeros(size)) if initial is None else initial
     return LatentForceModel(
-        dynamics, source.forces if isinstance(source, SpectralField) else {}, GaussianObservation(readings, noise),
-        Gaussian(jnp.zeros(size), jnp.zeros(size)) if initial is None else initial, state_names=state_names, **options)
+        lambda x, u, t: equation(x, amplitudes * u if has_source else 0.0), source.forces if has_source else {},
+        GaussianObservation(readings, noise), initial, state_names=state_names, **options)

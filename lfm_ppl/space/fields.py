@@ -2,16 +2,14 @@ r"""Gaussian processes in space and time, as independent copies v_j of a tempora
 
 The covariance of a field u(r, t) is the product of an isotropic kernel in space, k(|r - r'|), and that of the force.
 
-1. `SpectralField` expands it in eigenfunctions of the Laplacian: ``u(r, t) = sum_j sqrt(S(w_j)) phi_j(r) v_j(t)`` with
-   the spectral density S of the kernel in d dimensions, in closed form.
-2. `SeparableField` factorises the covariance of N points, ``u(r_i, t) = sum_j L_ij v_j(t)`` with ``L L' = K``, by
-   Cholesky's method with complete pivoting, which may stop at a rank below N.
+1. `SpectralField` expands it in eigenfunctions of the Laplacian, with the spectral density of the kernel.
+2. `SeparableField` factorises the covariance of N points by Cholesky's method with complete pivoting, which may stop at
+   a rank below N.
 3. It predicts at other places given the pivots P: the weights are ``K(r, P) L_P^-T``, and the variance that they do not
    explain is added.
 
-Sources: Solin and Särkkä (2020), Hilbert space methods for reduced-rank Gaussian process regression, Statistics and
-Computing 30; Hartikainen (2013), doctoral thesis, section 3.3; Harbrecht, Peters and Schneider (2012), On the low-rank
-approximation by the pivoted Cholesky decomposition, Applied Numerical Mathematics 62.
+Sources: Solin and Särkkä (2020), Statistics and Computing 30; Hartikainen (2013), doctoral thesis, section 3.3;
+Harbrecht, Peters and Schneider (2012), Applied Numerical Mathematics 62.
 """
 
 from __future__ import annotations
@@ -162,8 +160,8 @@ class SeparableField(SpaceTimeField):
 
     Raises:
         TypeError: an argument is of another type.
-        ValueError: points have a wrong shape or are not finite, the rank is not between 1 and N, kernel or force has a
-            mean, or the force is not stationary.
+        ValueError: points have a wrong shape or are not finite, the rank is not between 1 and N, or the force is not
+            stationary or has a mean.
 
     Example:
         >>> import numpy as np
