@@ -43,7 +43,7 @@ TRUTH = {"diffusivity": 0.01, "decay": 0.1, "scale": 1.0, "space_lengthscale": 0
 INITIAL_SD = 3.0
 
 
-def places(outputs) -> np.ndarray:
+def positions(outputs) -> np.ndarray:
     """Return the places (m) in the names of sensors."""
     try:
         return np.array([float(name.rpartition("=")[2]) for name in outputs])
@@ -65,7 +65,7 @@ def build(diffusivity, decay, scale, space_lengthscale, time_lengthscale, noise_
     process = source({"scale": scale, "space_lengthscale": space_lengthscale, "time_lengthscale": time_lengthscale},
                      length, modes)
     initial = lfm.Gaussian(jnp.zeros(modes), (INITIAL_SD / scale * process.amplitudes)**2)
-    return lfm.heat(process, diffusivity, decay, sensors=places(outputs), noise=noise_sd**2, initial=initial,
+    return lfm.heat(process, diffusivity, decay, sensors=positions(outputs), noise=noise_sd**2, initial=initial,
                     output_names=outputs, units=units)
 
 
@@ -94,7 +94,7 @@ def model(times, y=None, length: float = 1.0, modes: int = 8, outputs=("r=0.5",)
 
 def fields(data, length: float = 1.0, modes: int = 8) -> dict:
     """Return temperature and source, for figures."""
-    sensors = places(data.outputs)
+    sensors = positions(data.outputs)
     return {
         "temperature": {"field": lfm.LaplaceBasis((0.0, length), modes, "neumann"), "sensors": sensors, "unit": "K",
                         "length_unit": "m"},

@@ -60,21 +60,22 @@ def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any 
         return field if hasattr(field, "weights") else field(values)
 
     example = make({label: values[0] for label, values in parameters.items()})
-    places = np.asarray(_grid(example.domain) if points is None else points, float)
+    positions = np.asarray(_grid(example.domain) if points is None else points, float)
     weights, variance = jax.jit(jax.vmap(
-        lambda values: jax.tree.map(jax.numpy.asarray, make(values).weights(places))))(parameters)
-    stored = _coefficients(trajectories, example.names).drop_duplicates("at").transpose("chain", "draw", "at", ...)
-    values, times, along = stored.values, stored["at"].values, ("at", "place")
+        lambda values: jax.tree.map(jax.numpy.asarray, make(values).weights(positions))))(parameters)
+    coefficients = _coefficients(trajectories, example.names).drop_duplicates("at")
+    values = coefficients.transpose("chain", "draw", "at", ...).values
+    times, dims = coefficients["at"].values, ("at", "place")
     draws = values.reshape(-1, *values.shape[2:]) @ np.asarray(weights).swapaxes(1, 2)
-    variables = {"draws": (("chain", "draw", *along), draws.reshape(*values.shape[:2], *draws.shape[1:])),
-                 "mean": (along, draws.mean(0)),
-                 "sd": (along, np.sqrt(draws.var(0) + np.asarray(variance).mean(0)))}
-    if (truth := _truth(result, make, places, times)) is not None:
-        variables["truth"] = (along, truth)
+    variables = {"draws": (("chain", "draw", *dims), draws.reshape(*values.shape[:2], *draws.shape[1:])),
+                 "mean": (dims, draws.mean(0)),
+                 "sd": (dims, np.sqrt(draws.var(0) + np.asarray(variance).mean(0)))}
+    if (truth := _truth(result, make, positions, times)) is not None:
+        variables["truth"] = (dims, truth)
     if sensors is not None:
-        at_sensors = np.stack([np.asarray(sensors(t) if callable(sensors) else sensors, float) for t in times])
-        variables["sensors"] = (("at", "sensor", "axis"), at_sensors.reshape(*at_sensors.shape[:2], -1))
-    coords = {"at": stored["at"], "r": (("place", "axis"), places.reshape(len(places), -1))}
+        sensor_positions = np.stack([np.asarray(sensors(t) if callable(sensors) else sensors, float) for t in times])
+        variables["sensors"] = (("at", "sensor", "axis"), sensor_positions.reshape(*sensor_positions.shape[:2], -1))
+    coords = {"at": coefficients["at"], "r": (("place", "axis"), positions.reshape(len(positions), -1))}
     return xr.Dataset(variables, coords, {"name": name, "unit": unit, "length_unit": length_unit})
 
 
@@ -93,7 +94,7 @@ def _coefficients(dataset: xr.Dataset, names: tuple[str, ...]) -> xr.DataArray:
                      "field. Was its model made with this field?")
 
 
-def _truth(result: Any, make: Callable[[Any], Any], places: np.ndarray, times: np.ndarray) -> np.ndarray | None:
+def _truth(result: Any, make: Callable[[Any], Any], positions: np.ndarray, times: np.ndarray) -> np.ndarray | None:
     """Return the true field (K, P) where its coefficients and parameters are known."""
     try:
         truth = group(result, "truth")
@@ -102,10 +103,10 @@ def _truth(result: Any, make: Callable[[Any], Any], places: np.ndarray, times: n
     except (KeyError, ValueError):
         return None
     paths = paths.drop_duplicates("at_truth").interp(at_truth=times).transpose("at_truth", ...)
-    return paths.values @ np.asarray(field.weights(places)[0]).T
+    return paths.values @ np.asarray(field.weights(positions)[0]).T
 
 
 def _grid(domain: Any) -> np.ndarray:
-    axes = [np.linspace(low, high, 60 if len(domain) == 1 else 30) for low, high in domain]
-    places = np.stack([grid.ravel() for grid in np.meshgrid(*axes, indexing="ij")], axis=1)
-    return places[:, 0] if len(domain) == 1 else places
+    axes = [np.linspace(low, high, 60 if len(domain) == 1 else 20) for low, high in domain]
+    positions = np.stack([grid.ravel() for grid in np.meshgrid(*axes, indexing="ij")], axis=1)
+    return positions[:, 0] if len(domain) == 1 else positions

@@ -81,13 +81,13 @@ class LaplaceBasis(eqx.Module):
         Raises:
             ValueError: a place lies outside of the domain. Inside of compiled code there is no check.
         """
-        places, (low, high) = place_array(points, len(self.domain)), np.transpose(self.domain)
-        xp = jnp if checks.traced(places) else np
-        if xp is np and (outside := (np.abs(places - 0.5 * (low + high)) > 0.5000001 * (high - low)).any(1)).any():
-            raise ValueError(f"points[{outside.argmax()}] = {places[outside.argmax()].tolist()} lies outside of the "
-                             f"domain {self.domain}.")
+        positions, (low, high) = position_array(points, len(self.domain)), np.transpose(self.domain)
+        xp = jnp if checks.traced(positions) else np
+        if xp is np and (distance := (np.abs(positions - 0.5 * (low + high)) / (high - low)).max(1)).max() > 0.5000001:
+            index = distance.argmax()
+            raise ValueError(f"points[{index}] = {positions[index].tolist()} lies outside of the domain {self.domain}.")
         orders, wavenumbers = _orders_and_wavenumbers(self)
-        angles = wavenumbers * (places - low)[:, None, :]
+        angles = wavenumbers * (positions - low)[:, None, :]
         is_sine = (orders > 0) & (orders % 2 == 0 if self.boundary == "periodic" else self.boundary == "dirichlet")
         amplitudes = np.sqrt(np.where(orders == 0, 1.0, 2.0) / (high - low))
         return (amplitudes * xp.where(is_sine, xp.sin(angles), xp.cos(angles))).prod(-1)
@@ -116,14 +116,14 @@ class LaplaceBasis(eqx.Module):
         return jnp.asarray(self.functions(points).T * weight) @ values
 
 
-def place_array(points: ArrayLike, dimension: int | None = None) -> Any:
+def position_array(points: ArrayLike, dimension: int | None = None) -> Any:
     """Return places (P,) or (P, d) as an array (P, d); ``dimension`` None: any number of dimensions."""
-    places: Any = points if checks.traced(points) else np.asarray(points, float)
-    places = places[:, None] if places.ndim == 1 else places
-    if places.ndim != 2 or places.shape[0] == 0 or places.shape[1] != (dimension or places.shape[1]):
+    positions: Any = points if checks.traced(points) else np.asarray(points, float)
+    positions = positions[:, None] if positions.ndim == 1 else positions
+    if positions.ndim != 2 or positions.shape[0] == 0 or positions.shape[1] != (dimension or positions.shape[1]):
         raise ValueError(f"points must be an array of places (P, {dimension or 'd'}), got shape {np.shape(points)}.")
-    checks.finite("points", places)
-    return places
+    checks.finite("points", positions)
+    return positions
 
 
 @functools.lru_cache(maxsize=64)

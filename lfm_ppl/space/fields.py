@@ -26,7 +26,7 @@ from jax.typing import ArrayLike
 from lfm_ppl.forces.matern import Matern
 from lfm_ppl.forces.sde import ApproximationWarning, Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
-from lfm_ppl.space.eigenfunctions import LaplaceBasis, place_array
+from lfm_ppl.space.eigenfunctions import LaplaceBasis, position_array
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import pivoted_cholesky, safe_sqrt, solve_lower
 
@@ -70,9 +70,9 @@ class SpaceTimeField(eqx.Module):
         return dict.fromkeys(self.names, self.temporal_force)
 
     def _warn_of(self, lost_variance: jax.Array, remedy: str) -> None:
-        lost = checks.concrete(lost_variance)
-        if lost is not None and lost > _LARGEST_LOSS:
-            checks.warn(f"the {self.rank} forces of the field {self.name!r} leave out {100 * float(lost):.0f}% of its "
+        share = checks.concrete(lost_variance)
+        if share is not None and share > _LARGEST_LOSS:
+            checks.warn(f"the {self.rank} forces of the field {self.name!r} leave out {100 * float(share):.0f}% of its "
                         f"variance. Use {remedy}.", ApproximationWarning)
 
 
@@ -179,7 +179,7 @@ class SeparableField(SpaceTimeField):
 
     def __init__(self, points: ArrayLike, spatial_kernel: Kernel, temporal_force: Force, rank: int | None = None,
                  name: str = "field"):
-        self.points = place_array(points)
+        self.points = position_array(points)
         rank = len(self.points) if rank is None else rank
         checks.positive_integer("rank", rank)
         if rank > len(self.points):
@@ -211,8 +211,8 @@ class SeparableField(SpaceTimeField):
 
         Given the forces, the field at a place is normal, with the mean ``weights @ v`` and this variance (P,).
         """
-        places = place_array(points, self.points.shape[1])
-        cross = self._covariance(jnp.asarray(self.points)[self.pivots], places)
+        positions = position_array(points, self.points.shape[1])
+        cross = self._covariance(jnp.asarray(self.points)[self.pivots], positions)
         weights = solve_lower(self.root[self.pivots], cross).T
         residual = jnp.maximum(self.spatial_kernel.scale**2 - (weights**2).sum(1), 0.0)
         return weights, residual * self.temporal_force.covariance(0.0)

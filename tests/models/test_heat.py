@@ -23,9 +23,9 @@ def test_no_draw_of_the_prior_fails():
 
 
 def test_columns_are_named_by_places():
-    assert FILE.definitions["places"](("r=0.25", "0.5")).tolist() == [0.25, 0.5]
+    assert FILE.definitions["positions"](("r=0.25", "0.5")).tolist() == [0.25, 0.5]
     with pytest.raises(ValueError, match="r=0.25"):
-        FILE.definitions["places"](("inside",))
+        FILE.definitions["positions"](("inside",))
     with pytest.raises(ValueError, match="domain"):
         numpyro.handlers.seed(FILE.model, 0)(np.arange(3.0), np.zeros((3, 1)), outputs=("r=1.5",))
 

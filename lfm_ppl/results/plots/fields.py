@@ -106,12 +106,12 @@ def _draw_against_time(figure: Figure, axes: Axes, dataset: xr.Dataset, kind: st
 
 
 def _draw_band(axes: Axes, snapshot: xr.Dataset, title: str) -> None:
-    places, mean, sd = snapshot["r"].values[:, 0], snapshot["mean"].values, snapshot["sd"].values
+    positions, mean, sd = snapshot["r"].values[:, 0], snapshot["mean"].values, snapshot["sd"].values
     style.tidy(axes, 3, title=title, xlabel=_place_label(snapshot))
-    axes.plot(places, mean, color=style.BLUE, label="posterior mean")
-    axes.fill_between(places, mean - 1.96 * sd, mean + 1.96 * sd, color="#8FBFDE", lw=0, zorder=1, label="95%")
+    axes.plot(positions, mean, color=style.BLUE, label="posterior mean")
+    axes.fill_between(positions, mean - 1.96 * sd, mean + 1.96 * sd, color="#8FBFDE", lw=0, zorder=1, label="95%")
     if "truth" in snapshot:
-        axes.plot(places, snapshot["truth"].values, **style.TRUTH)
+        axes.plot(positions, snapshot["truth"].values, **style.TRUTH)
     if "sensors" in snapshot:
         sensors = snapshot["sensors"].values[:, 0]
         axes.plot(sensors, np.full(len(sensors), 0.03), "^", transform=axes.get_xaxis_transform(), ms=2.5, mew=0,
