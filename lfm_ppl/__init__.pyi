@@ -69,10 +69,12 @@ from .results.accuracy import check_accuracy as check_accuracy
 from .results.arviz_data import load as load
 from .results.arviz_data import save as save
 from .results.correction import correct_posterior as correct_posterior
+from .results.fields import evaluate_field as evaluate_field
 from .results.html_report import save_report as save_report
 from .results.plots import plot_accuracy as plot_accuracy
 from .results.plots import plot_calibration as plot_calibration
 from .results.plots import plot_deterministics as plot_deterministics
+from .results.plots import plot_field as plot_field
 from .results.plots import plot_fit as plot_fit
 from .results.plots import plot_forces as plot_forces
 from .results.plots import plot_inputs as plot_inputs
@@ -83,6 +85,11 @@ from .results.plots import plot_trace as plot_trace
 from .results.scoring import score as score
 from .results.series import select_series as select_series
 from .results.sites import select_site as select_site
+from .space.eigenfunctions import LaplaceBasis as LaplaceBasis
+from .space.equations import heat as heat
+from .space.equations import wave as wave
+from .space.fields import SeparableField as SeparableField
+from .space.fields import SpectralField as SpectralField
 from .switching.rao_blackwellised import rao_blackwellised as rao_blackwellised
 from .switching.rule import SwitchingRule as SwitchingRule
 from .switching.rule import Thermostat as Thermostat

@@ -20,7 +20,7 @@ LAYERS = (
     ("forces",),
     ("linearisation",),
     ("model",),
-    ("orbits", "io"),
+    ("orbits", "io", "space"),
     ("filtering",),
     ("particles", "fokker_planck_grid", "latent_grid", "constrained"),
     ("switching",),

@@ -29,6 +29,7 @@ from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import OF_SERIES, Data, stack_series
 from lfm_ppl.io.truth import read_truth
 from lfm_ppl.results import arviz_data, checkpoint, files, html_report, tables
+from lfm_ppl.results.fields import add_fields
 from lfm_ppl.utils import calendar_time
 from lfm_ppl.utils.interruption import INTERRUPTED, interruptible
 from lfm_ppl.utils.progress import duration
@@ -50,7 +51,7 @@ def run(name: str, options: FitArguments, line: Sequence[str]) -> int:
     model = loading.load(name)
     model_options = choices.options(model, options.inference.option)
     observed = observed_data(options.data, model, model_options)
-    keywords = model.keywords(observed, model_options)
+    keywords, fields = model.keywords(observed, model_options), model.fields(observed, model_options)
     fixed = choices.fixed(options.inference.set, model.anchors(observed), model.options)
     times = trajectory_times(observed, output.times)
     numpyro_model = approximated_model(options, model)
@@ -76,6 +77,7 @@ def run(name: str, options: FitArguments, line: Sequence[str]) -> int:
                 attributes=result_attributes(options, line, model, observed, model_options),
                 **sampling_arguments(options, model))
             partial = arviz_data.attributes(posterior).get("partial")
+            add_fields(posterior, fields)
             # The report is written last: without it the run was killed while it drew its figures.
             if is_finished and partial is None and (folder / html_report.NAME).is_file():
                 print(f"\nthe run in {folder} is complete; nothing was changed")

@@ -36,13 +36,13 @@ def scalar_parameter(name: str, value: Any) -> jax.Array:
     return array
 
 
-def standard_deviation_parameter(name: str, value: Any) -> jax.Array:
+def non_negative_parameter(name: str, value: Any) -> jax.Array:
     """Return ``value`` as a scalar array after checking that it is one number, zero or above."""
-    deviation = scalar_parameter(name, value)
-    concrete = checks.concrete(deviation)
+    parameter = scalar_parameter(name, value)
+    concrete = checks.concrete(parameter)
     if concrete is not None and concrete < 0:
         raise ValueError(f"{name} must be >= 0, got {concrete:g}.")
-    return deviation
+    return parameter
 
 
 def static_order(order: Any, allowed: Sequence[int]) -> int:

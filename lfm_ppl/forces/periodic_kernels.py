@@ -22,7 +22,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.matern import Matern
-from lfm_ppl.forces.parameters import positive_parameter, scalar_parameter, standard_deviation_parameter, static_order
+from lfm_ppl.forces.parameters import non_negative_parameter, positive_parameter, scalar_parameter, static_order
 from lfm_ppl.utils import checks
 
 
@@ -178,7 +178,7 @@ class ModeratedPeriodicMatern(PeriodicCovariance):
         self.scale = positive_parameter("scale", scale)
         self.lengthscale = positive_parameter("lengthscale", lengthscale)
         self.period, self.has_fixed_period = positive_parameter("period", period), _is_number(period)
-        self.decay = standard_deviation_parameter("decay", decay)
+        self.decay = non_negative_parameter("decay", decay)
         self.order = static_order(order, Matern.orders)
 
     @property

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from lfm_ppl.forces.parameters import Mean, mean_parameter, positive_parameter, standard_deviation_parameter
+from lfm_ppl.forces.parameters import Mean, mean_parameter, non_negative_parameter, positive_parameter
 from lfm_ppl.forces.sde import Force
 
 
@@ -41,7 +41,7 @@ class RandomWalk(Force):
 
     def __init__(self, scale: ArrayLike, initial_sd: ArrayLike = 0.0, mean: Mean = 0.0):
         self.scale = positive_parameter("scale", scale)
-        self.initial_sd = standard_deviation_parameter("initial_sd", initial_sd)
+        self.initial_sd = non_negative_parameter("initial_sd", initial_sd)
         self.mean = mean_parameter(mean)
 
     def initial_covariance(self) -> jax.Array:

@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import gauss_legendre
-from lfm_ppl.forces.parameters import Mean, mean_parameter, positive_parameter, standard_deviation_parameter
+from lfm_ppl.forces.parameters import Mean, mean_parameter, non_negative_parameter, positive_parameter
 from lfm_ppl.forces.sde import Force
 
 _NODES, _WEIGHTS = gauss_legendre(16)
@@ -62,9 +62,9 @@ class Resonator(Force):
     def __init__(self, period: ArrayLike, scale: ArrayLike, noise: ArrayLike = 0.0, damping: ArrayLike = 0.0,
                  mean: Mean = 0.0):
         self.period = positive_parameter("period", period)
-        self.scale = standard_deviation_parameter("scale", scale)
-        self.noise = standard_deviation_parameter("noise", noise)
-        self.damping = standard_deviation_parameter("damping", damping)
+        self.scale = non_negative_parameter("scale", scale)
+        self.noise = non_negative_parameter("noise", noise)
+        self.damping = non_negative_parameter("damping", damping)
         self.mean = mean_parameter(mean)
 
     @property

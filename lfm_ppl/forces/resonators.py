@@ -7,7 +7,7 @@ from jax.typing import ArrayLike
 
 from lfm_ppl.forces.basis import Waves
 from lfm_ppl.forces.constant import Constant
-from lfm_ppl.forces.parameters import Mean, standard_deviation_parameter
+from lfm_ppl.forces.parameters import Mean, non_negative_parameter
 from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
 from lfm_ppl.forces.quasi_periodic import EXPLAINED_VARIANCE, stationary_basis, warn_of_lost_variance
 from lfm_ppl.forces.resonator import Resonator
@@ -50,7 +50,7 @@ def resonators(kernel: PeriodicCovariance, functions: int | None = None, gamma: 
 
     Source: Reece et al. (2014), appendix B.1.1.
     """
-    noise_sd = standard_deviation_parameter("noise", noise)
+    noise_sd = non_negative_parameter("noise", noise)
     basis: Waves = stationary_basis(kernel, functions, gamma)
     warn_of_lost_variance(kernel, basis, explained_variance)
     scales = safe_sqrt(basis.powers)

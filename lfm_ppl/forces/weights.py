@@ -22,7 +22,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.matern import Matern
-from lfm_ppl.forces.parameters import positive_parameter, scalar_parameter, standard_deviation_parameter
+from lfm_ppl.forces.parameters import non_negative_parameter, positive_parameter, scalar_parameter
 from lfm_ppl.forces.sde import Force
 from lfm_ppl.utils import checks
 
@@ -167,7 +167,7 @@ class WQM(_StepEvolution):
     growth: jax.Array
 
     def __init__(self, growth: ArrayLike, change_points: Sequence[float]):
-        self.growth = standard_deviation_parameter("growth", growth)
+        self.growth = non_negative_parameter("growth", growth)
         self.change_points = _increasing_times(change_points)
         self.mean = scalar_parameter("mean", 0.0)
 

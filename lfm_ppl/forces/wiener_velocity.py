@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from lfm_ppl.forces.parameters import Mean, mean_parameter, positive_parameter, standard_deviation_parameter
+from lfm_ppl.forces.parameters import Mean, mean_parameter, non_negative_parameter, positive_parameter
 from lfm_ppl.forces.sde import Force
 
 
@@ -56,8 +56,8 @@ class WienerVelocity(Force):
         mean: Mean = 0.0,
     ):
         self.scale = positive_parameter("scale", scale)
-        self.initial_value_sd = standard_deviation_parameter("initial_value_sd", initial_value_sd)
-        self.initial_velocity_sd = standard_deviation_parameter("initial_velocity_sd", initial_velocity_sd)
+        self.initial_value_sd = non_negative_parameter("initial_value_sd", initial_value_sd)
+        self.initial_velocity_sd = non_negative_parameter("initial_velocity_sd", initial_velocity_sd)
         self.mean = mean_parameter(mean)
 
     def initial_covariance(self) -> jax.Array:

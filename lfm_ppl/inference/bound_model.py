@@ -35,6 +35,9 @@ from lfm_ppl.utils import checks
 FORWARD_MODE_LIMIT = 10
 """Largest number of unconstrained parameters for which forward-mode gradients are faster."""
 
+_MANY_STATES = 12
+"""Number of states of a linear time-invariant model above which its gradient is faster in reverse mode."""
+
 _ATTEMPTS = 20
 """Points that are drawn in the search for one of finite density."""
 
@@ -122,8 +125,10 @@ class BoundModel:
 
     @property
     def forward_mode(self) -> bool:
-        """Whether gradients are taken in forward mode, which is faster for up to ten parameters."""
-        return self.size <= FORWARD_MODE_LIMIT
+        """Whether gradients are taken in forward mode, faster for few parameters and few linear states."""
+        return self.size <= FORWARD_MODE_LIMIT and not any(
+            site.example.ssm.mean_invariant and site.example.ssm.state_dim > _MANY_STATES
+            for site in self.traced.likelihoods)
 
     @property
     def site(self) -> LikelihoodSite:

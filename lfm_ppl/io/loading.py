@@ -9,6 +9,7 @@ and may define, each with a sensible default,
     simulate(seed=0, **options) -> lfm.Data     its default data
     prepare(data) -> lfm.Data                   converts the data of a file for ``model``
     anchors(data) -> dict                       parameters that are fixed for such data unless freed
+    fields(data, **options) -> dict             fields in space that are drawn: name -> keywords of `lfm.evaluate_field`
     OUTPUTS      names of the outputs; None: the columns of the data file
     INPUTS       known inputs: name -> how they are read, "previous", "linear", "zero" or "dose:STATE", see
                  `lfm_ppl.read_csv`
@@ -96,6 +97,10 @@ class ModelFile:
         """Return the parameters that are fixed for this data unless the user frees them."""
         return dict(self._call("anchors", Mapping, data))
 
+    def fields(self, data: Data, options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the fields in space of this data: name -> keyword arguments of `lfm_ppl.evaluate_field`."""
+        return dict(self._call("fields", Mapping, data, **options))
+
     def keywords(self, data: Data, options: Mapping[str, Any]) -> dict[str, Any]:
         """Return the keyword arguments of ``model`` for this data and these options."""
         keywords = {name: default for name, (default, _, _) in self.options.items()} | dict(options)
@@ -136,13 +141,13 @@ class ModelFile:
         return replace(data, units={**self.units, **data.units})
 
     def _call(self, name: str, result_type: type, *arguments: Any, **keywords: Any) -> Any:
-        """Return the result of a function of the file; without it, the data of ``prepare`` or no anchors."""
+        """Return the result of a function of the file; without it, the data of ``prepare`` or an empty mapping."""
         if name not in self.definitions:
             return arguments[0] if name == "prepare" else {}
         _check_signature(self.path, self.definitions, name, *arguments, **keywords)
         result = self.definitions[name](*arguments, **keywords)
         if not isinstance(result, result_type):
-            expected = "lfm.Data" if result_type is Data else "a mapping of names of parameters to values"
+            expected = "lfm.Data" if result_type is Data else "a mapping"
             raise TypeError(f"{name} in {self.path} must return {expected}, got {type(result).__name__}.")
         return result
 
@@ -207,7 +212,7 @@ def _execute(path: Path) -> ModuleType:
 
 
 _FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    **dict.fromkeys(("simulate", "prepare", "anchors"), ("a function", callable)),
+    **dict.fromkeys(("simulate", "prepare", "anchors", "fields"), ("a function", callable)),
     **dict.fromkeys(("UNITS", "PARAMETERS", "OPTIONS"), ("a mapping", lambda value: isinstance(value, Mapping))),
     "OUTPUTS": ('a tuple of names, as in ("x",)', lambda value: (
         isinstance(value, (tuple, list)) and len(value) > 0 and all(isinstance(name, str) for name in value))),
@@ -248,7 +253,7 @@ def _checked(path: Path, module: ModuleType) -> ModelFile:
 
 
 _ARGUMENTS = {"model": "(times, y=None) and the names in OPTIONS", "simulate": "seed and the names in OPTIONS",
-              "prepare": "the data", "anchors": "the data"}
+              "prepare": "the data", "anchors": "the data", "fields": "the data and the names in OPTIONS"}
 
 
 def _check_signature(path: Path, definitions: Mapping[str, Any], name: str, *arguments: Any, **keywords: Any) -> None:

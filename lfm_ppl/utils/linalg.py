@@ -382,17 +382,28 @@ def pivoted_root(p: jax.Array) -> jax.Array:
         return p
     sd = safe_sqrt(diagonal(p))
     inverse = _divide(jnp.ones(()), sd)
-    tolerance = p.shape[-1] * jnp.finfo(p.dtype).eps
+    return sd[:, None] * pivoted_cholesky(p * inverse[:, None] * inverse, p.shape[-1])[0]
 
-    def eliminate(remainder: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+
+def pivoted_cholesky(p: jax.Array, rank: int) -> tuple[jax.Array, jax.Array]:
+    """Return the leading columns ``R`` (n, rank) of Cholesky's method with complete pivoting, and the pivots (rank,).
+
+    The pivot of a step has the largest remaining variance. A remainder of rounding errors gives a zero column. The
+    rows of the pivots, ``R[pivots]``, are lower triangular.
+
+    Source: Higham (2002), Accuracy and Stability of Numerical Algorithms, section 10.3.
+    """
+    tolerance = jax.lax.stop_gradient(p.shape[-1] * jnp.finfo(p.dtype).eps * diagonal(p).max())
+
+    def eliminate(remainder: jax.Array, _: None) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         index = jnp.argmax(diagonal(remainder))
         column = remainder[:, index]
         is_positive = column[index] > tolerance
         column = jnp.where(is_positive, column / jnp.sqrt(jnp.where(is_positive, column[index], 1.0)), 0.0)
-        return remainder - column[:, None] * column, column
+        return remainder - column[:, None] * column, (column, index)
 
-    _, columns = jax.lax.scan(eliminate, p * inverse[:, None] * inverse, None, length=p.shape[-1])
-    return sd[:, None] * columns.T
+    _, (columns, pivots) = jax.lax.scan(eliminate, p, None, length=rank)
+    return columns.T, pivots
 
 
 def _divide(a: jax.Array, b: jax.Array) -> jax.Array:

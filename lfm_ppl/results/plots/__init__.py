@@ -3,6 +3,7 @@
 from lfm_ppl.results.plots.accuracy import plot_accuracy
 from lfm_ppl.results.plots.calibration import plot_calibration
 from lfm_ppl.results.plots.chains import plot_trace
+from lfm_ppl.results.plots.fields import plot_field
 from lfm_ppl.results.plots.inputs import plot_inputs
 from lfm_ppl.results.plots.pairs import plot_pairs
 from lfm_ppl.results.plots.residuals import plot_residuals
@@ -13,6 +14,7 @@ __all__ = [
     "plot_accuracy",
     "plot_calibration",
     "plot_deterministics",
+    "plot_field",
     "plot_fit",
     "plot_forces",
     "plot_inputs",

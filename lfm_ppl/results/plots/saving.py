@@ -11,9 +11,10 @@ from typing import Any
 from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 
-from lfm_ppl.results.arviz_data import group, has_group, of_mode, refuse_several_sites
+from lfm_ppl.results.arviz_data import group, groups, has_group, of_mode, refuse_several_sites
+from lfm_ppl.results.fields import GROUP as FIELD
 from lfm_ppl.results.inputs import inputs_of
-from lfm_ppl.results.plots import accuracy, chains, forecasts, inputs, pairs, residuals, trajectories
+from lfm_ppl.results.plots import accuracy, chains, fields, forecasts, inputs, pairs, residuals, trajectories
 from lfm_ppl.results.scalars import sampled
 from lfm_ppl.results.series import series_dimension, series_labels
 from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
@@ -36,9 +37,10 @@ def save_figures(
 ) -> list[Path]:
     """Draw every figure that ``result`` has the groups for, and write it to ``folder``.
 
-    The figures are fit, inputs, forces, deterministics, states, trace (not of sampler "map", which has no chains),
-    pairs, residuals and accuracy. A forecast that was made after the fit has its own: forecast, forecast-inputs and so
-    on. What does not fit on one page goes to numbered ones, such as ``trace-1.png`` and ``trace-2.png``, five at most.
+    The figures are fit, inputs, forces, deterministics, states, fields, trace (not of sampler "map", which has no
+    chains), pairs, residuals and accuracy. A forecast that was made after the fit has its own: forecast,
+    forecast-inputs and so on. What does not fit on one page goes to numbered ones, such as ``trace-1.png`` and
+    ``trace-2.png``, five at most.
     Every file is written under a temporary name and renamed.
 
     Args:
@@ -85,7 +87,7 @@ def save_figures(
     return paths
 
 
-def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[str] | None]]:
+def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, Any]]:
     """Yield file name, function and the names to draw, for each page of each figure."""
     refuse_several_sites(result)
     later = forecasts.is_made_later(result)
@@ -99,6 +101,8 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, list[
             title = f"{prefix}{kind}".replace("forecast-fit", "forecast")
             draw = draw if prefix or not later else _of_the_fit(draw)
             yield from _pages(title, draw, names, trajectories.MAX_PANELS, series if kind != "inputs" else [])
+    for name in (name.removeprefix(FIELD) for name in groups(result) if name.startswith(FIELD)):
+        yield f"field-{name}", fields.plot_field, name
     if has_group(result, "posterior"):
         labels = sampled(group(result, "posterior"))
         if not of_mode(result):  # independent draws have no chains to look at

@@ -1,0 +1,1 @@
+"""Fields in space and time: the heat and wave equations, and separable processes."""
