@@ -42,6 +42,9 @@ from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
 
+FORWARD_MODE_LIMIT = 10
+"""Number of parameters up to which a gradient in forward mode is faster than in reverse mode."""
+
 
 class SeriesLikelihood(dist.Distribution):
     """Distribution of the observations of one series, with state and forces integrated out.
@@ -63,6 +66,8 @@ class SeriesLikelihood(dist.Distribution):
     method: str = RUNGE_KUTTA
     sites: SiteSettings | None = None
     layout: GridLayout | None = None
+    regime_names: tuple[str, ...] = ()
+    forward_mode_limit: int = FORWARD_MODE_LIMIT
 
     def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None, steps: int) -> None:
         refuse_times_by_site(times)

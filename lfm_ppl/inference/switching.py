@@ -121,6 +121,7 @@ class Switching(SeriesLikelihood):
 
     pytree_data_fields = ("models", "rates", "initial")
     pytree_aux_fields = ("regime_names", "merging", "max_step")
+    forward_mode_limit = 1  # the filters of all pairs of regimes are slow with a tangent for each parameter
 
     def __init__(self, models: Mapping[str, LatentForceModel], rates: ArrayLike, times: ArrayLike,
                  rule: Rule | None = None, steps: int = 10, max_step: float | None = None, *,
