@@ -189,10 +189,12 @@ class SeriesLikelihood(dist.Distribution):
             ValueError: in a plate, where several series are an `lfm_ppl.panel`.
         """
         if tuple(batch_shape) and any(isinstance(handler, numpyro.plate) for handler in _PYRO_STACK):
-            raise ValueError("an lfm.MarginalLikelihood is the distribution of one series, and cannot be repeated to "
-                             f"the batch shape {tuple(batch_shape)} of a numpyro.plate. For several series take "
-                             "lfm.panel(build, parameters, times) in the plate, with a leading axis of its size in "
-                             "parameters; for one series put the site outside of the plate.")
+            several = ("give each a site of its own" if self.regime_names else
+                       "take lfm.panel(build, parameters, times) in the plate, with a leading axis of its size in "
+                       "parameters")
+            raise ValueError(f"an lfm.{type(self).__name__} is the distribution of one series, and cannot be repeated "
+                             f"to the batch shape {tuple(batch_shape)} of a numpyro.plate. For several series "
+                             f"{several}; for one series put the site outside of the plate.")
         return super().expand(batch_shape)
 
     def filter(self, y: Any) -> FilterResult:
