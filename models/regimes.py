@@ -12,7 +12,7 @@ The drift is a Gaussian process with a Matern-1/2 covariance. The regime is cons
 difference is positive, so that the regimes cannot exchange their names. The likelihood merges the states of the regimes
 by their moments.
 
-A data file has the columns time_kyr and d18O. Time runs forward: of an age before present it is the negative.
+A data file has the columns time (kyr) and d18O. Time runs forward: it is minus the age before present.
 
 Sources: North Greenland Ice Core Project members, High-resolution record of Northern Hemisphere climate extending into
 the last interglacial period, Nature 431 (2004); P. D. Ditlevsen, Observation of alpha-stable noise induced millennial
@@ -47,7 +47,7 @@ PARAMETERS = {
 }
 TRUTH = {"level": -43.0, "difference": 3.0, "rate": 15.0, "to_warm": 0.6, "to_cold": 0.8, "scale": 0.8,
          "lengthscale": 2.0, "noise_sd": 0.5}
-TIMES = 0.1 * np.arange(-200, 1)  # of the default data (kyr)
+TIMES = np.arange(-200, 1) / 10.0  # of the default data (kyr)
 START_SD = 3.0  # of the isotopes at the first time, about the level of each regime (permille)
 
 
