@@ -94,6 +94,7 @@ def _print_sites(model: loading.ModelFile, bound: Any) -> None:
     parts = [f"{example.rule.name}, {example.steps} steps", example.iterations and f"{example.iterations} iterations"]
     text = "exact: the model is linear" if is_exact(example.ssm) else ", ".join(filter(None, parts)) + (
         f"; sites by {example.sites_in_words}" if example.sites_in_words else "")
+    text = text if example.has_gaussian_state else example.description
     print(f"likelihood: {text}\n")
     model_names = {"time", *model.inputs, *system.output_names, *system.state_names, *system.force_names,
                    *system.deterministic_names, *trace}

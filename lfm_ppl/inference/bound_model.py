@@ -28,15 +28,9 @@ from lfm_ppl.inference.model_arguments import ModelArguments, signature
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.random_keys import split_keys
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.inference.series_likelihood import FORWARD_MODE_LIMIT, SeriesLikelihood
 from lfm_ppl.inference.traced_model import TracedModel
 from lfm_ppl.utils import checks
-
-FORWARD_MODE_LIMIT = 10
-"""Largest number of unconstrained parameters for which forward-mode gradients are faster."""
-
-_MANY_STATES = 12
-"""Number of states of a linear time-invariant model above which its gradient is faster in reverse mode."""
 
 _ATTEMPTS = 20
 """Points that are drawn in the search for one of finite density."""
@@ -125,10 +119,9 @@ class BoundModel:
 
     @property
     def forward_mode(self) -> bool:
-        """Whether gradients are taken in forward mode, faster for few parameters and few linear states."""
-        return self.size <= FORWARD_MODE_LIMIT and not any(
-            site.example.ssm.mean_invariant and site.example.ssm.state_dim > _MANY_STATES
-            for site in self.traced.likelihoods)
+        """Whether gradients are taken in forward mode, which is faster for few parameters."""
+        return self.size <= min((site.example.forward_mode_limit for site in self.traced.likelihoods),
+                                default=FORWARD_MODE_LIMIT)
 
     @property
     def site(self) -> LikelihoodSite:

@@ -42,6 +42,12 @@ from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
 
+FORWARD_MODE_LIMIT = 10
+"""Number of parameters up to which a gradient in forward mode is faster than in reverse mode."""
+
+_MANY_STATES = 12
+"""Number of states of a linear time-invariant model above which its gradient is faster in reverse mode."""
+
 
 class RowScores(NamedTuple):
     """Scores of the rows of the data.
@@ -77,6 +83,7 @@ class SeriesLikelihood(dist.Distribution):
     method: str = RUNGE_KUTTA
     sites: SiteSettings | None = None
     layout: GridLayout | None = None
+    regime_names: tuple[str, ...] = ()
 
     def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None, steps: int) -> None:
         refuse_times_by_site(times)
@@ -136,6 +143,11 @@ class SeriesLikelihood(dist.Distribution):
     def is_family(self) -> bool:
         """Whether the observation is a family such as `lfm_ppl.PoissonObservation`, and not Gaussian."""
         return isinstance(self.model.observation, ObservationFamily)
+
+    @property
+    def forward_mode_limit(self) -> int:
+        """Number of parameters up to which gradients in forward mode are faster; none with many linear states."""
+        return 0 if self.ssm.mean_invariant and self.ssm.state_dim > _MANY_STATES else FORWARD_MODE_LIMIT
 
     @property
     def ssms(self) -> tuple[StateSpaceModel, ...]:
@@ -198,10 +210,12 @@ class SeriesLikelihood(dist.Distribution):
             ValueError: in a plate, where several series are an `lfm_ppl.panel`.
         """
         if tuple(batch_shape) and any(isinstance(handler, numpyro.plate) for handler in _PYRO_STACK):
-            raise ValueError("an lfm.MarginalLikelihood is the distribution of one series, and cannot be repeated to "
-                             f"the batch shape {tuple(batch_shape)} of a numpyro.plate. For several series take "
-                             "lfm.panel(build, parameters, times) in the plate, with a leading axis of its size in "
-                             "parameters; for one series put the site outside of the plate.")
+            several = ("give each a site of its own" if self.regime_names else
+                       "take lfm.panel(build, parameters, times) in the plate, with a leading axis of its size in "
+                       "parameters")
+            raise ValueError(f"an lfm.{type(self).__name__} is the distribution of one series, and cannot be repeated "
+                             f"to the batch shape {tuple(batch_shape)} of a numpyro.plate. For several series "
+                             f"{several}; for one series put the site outside of the plate.")
         return super().expand(batch_shape)
 
     def filter(self, y: Any) -> FilterResult:

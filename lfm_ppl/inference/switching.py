@@ -142,6 +142,11 @@ class Switching(SeriesLikelihood):
         return False
 
     @property
+    def forward_mode_limit(self) -> int:
+        """One parameter: the filters of all pairs of regimes are slow with a tangent for each."""
+        return 1
+
+    @property
     def settings(self) -> dict[str, Any]:
         """Arguments besides models, rates and times."""
         return {name: getattr(self, name) for name in ("rule", "steps", "max_step", "initial", "merging")}

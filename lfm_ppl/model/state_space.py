@@ -148,7 +148,10 @@ def state_space(model: LatentForceModel) -> StateSpaceModel:
 
     Raises:
         ValueError: ``nonlinear_inputs`` omits an input that enters non-linearly; the message names it.
+        TypeError: not a latent force model.
     """
+    if not isinstance(model, LatentForceModel):
+        raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
     stack = Stack(model.force_list)
     size, total = len(model.state_names), len(model.state_names) + len(stack.forces)
     if total == 0:

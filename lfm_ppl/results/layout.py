@@ -21,7 +21,7 @@ from lfm_ppl.forces.quasi_periodic import QuasiPeriodic
 from lfm_ppl.inference.posterior import LOG_PRIOR
 from lfm_ppl.io.truth import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
-from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, PERIODS, mixture_quantiles, predictions
+from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, PERIODS, REGIMES, mixture_quantiles, predictions
 from lfm_ppl.results.scalars import DERIVED, units_attribute
 from lfm_ppl.results.series import SERIES, plate_dimension, time_coordinate
 from lfm_ppl.utils import checks
@@ -207,6 +207,8 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
         groups["trajectories"]["outputs"].attrs["long_name"] = NOISE_FREE
         if periods := force_periods(model):
             groups["trajectories"]["forces"].attrs[PERIODS] = json.dumps(periods)
+        if site.example.regime_names:
+            groups["trajectories"]["states"].attrs[REGIMES] = json.dumps(site.example.regime_names)
         groups["trajectories"] = with_summaries(groups["trajectories"], paths)
         if "prediction" in paths and grid is not None:
             groups[GROUP] = predictions(bound, paths, np.asarray(draw_index), grid, labels.coords, labels.series)

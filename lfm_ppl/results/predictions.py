@@ -36,6 +36,9 @@ INTERVAL = (0.025, 0.975)
 PERIODS = "periods"
 """Attribute of trajectories of forces: name -> period of those that repeat, as JSON."""
 
+REGIMES = "regimes"
+"""Attribute of trajectories of states: the states that indicate regimes, as JSON."""
+
 SHOWN_PERIODS = 3
 """Number of periods, the last ones, that figures show of a force that repeats often."""
 

@@ -37,6 +37,7 @@ def check_rates(rates: Any, count: int) -> jax.Array:
                     if np.allclose(value.sum(1), 1.0) else "")
             raise ValueError("the diagonal of rates must be zero, or minus the sum of the other rates of its row, got "
                              f"{value.tolist()}.{hint}")
+    leaving = jnp.where(leaving < 0.0, jnp.nan, leaving)  # a density of -inf where the rates are traced
     return leaving - jnp.diag(leaving.sum(1))
 
 

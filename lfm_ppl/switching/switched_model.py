@@ -100,14 +100,17 @@ def build_models(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ..
 def check_structure(ssms: Mapping[str, StateSpaceModel]) -> None:
     """Raise ValueError unless the models, by their names in messages, differ in coefficients only."""
     first, *_ = names = list(ssms)
-    structures = [(ssm.model.state_names, ssm.model.force_names, ssm.model.output_names, ssm.model.deterministic_names,
-                   ssm.model.observation.angular, ssm.state_dim, ssm.stack.jump_times) for ssm in ssms.values()]
+    structures = [{"states": ssm.model.state_names, "forces": ssm.model.force_names,
+                   "outputs": ssm.model.output_names, "deterministics": ssm.model.deterministic_names,
+                   "angular outputs": ssm.model.observation.angular, "a joint state of size": ssm.state_dim,
+                   "jump times": ssm.stack.jump_times} for ssm in ssms.values()]
     for name, structure in zip(names, structures, strict=True):
         if ssms[name].model.events:
             raise ValueError(f"{name} has events, which a model that switches does not support; leave them out.")
-        if structure != structures[0]:
-            raise ValueError(f"{name} has other states, forces, outputs, deterministics or jump times than {first}; "
-                             "models between which the system switches may differ in coefficients only.")
+        for kind, value in structure.items():
+            if value != structures[0][kind]:
+                raise ValueError(f"{name} has {kind} {value}, and {first} has {structures[0][kind]}; models between "
+                                 "which the system switches may differ in coefficients only.")
 
 
 def decision_grid(ssm: StateSpaceModel, times: Any, decisions: Any, start: FilterState | None, steps: int,

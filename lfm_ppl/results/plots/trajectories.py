@@ -3,6 +3,7 @@
 1. Select the trajectories of one kind, and their predictions; beside a short forecast, the last rows only.
 2. Draw the mean and the 95% band, from the mixture over the draws if it is stored, else from the draws.
 3. Draw forecasts after the last observation, missing values, held-out data and the truth.
+4. Draw all regimes of a switching model in one panel: the areas of their probabilities, which sum to one.
 """
 
 from __future__ import annotations
@@ -20,13 +21,14 @@ from matplotlib.figure import Figure
 from lfm_ppl.results.arviz_data import group, has_group, refuse_several_sites
 from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import forecasts, style
-from lfm_ppl.results.predictions import INTERVAL, PERIODS, SHOWN_PERIODS, quantiles, repeats_often
+from lfm_ppl.results.predictions import INTERVAL, PERIODS, REGIMES, SHOWN_PERIODS, quantiles, repeats_often
 from lfm_ppl.results.scalars import unit_of
 from lfm_ppl.results.series import select_series, series_dimension, series_labels
 from lfm_ppl.utils.checks import unknown
 
 MAX_PANELS = 12
 _MANY = 150  # measurements
+_PROBABILITY = "probability"
 _FORCE, _DETERMINISTIC = "#9AD3C1", "#F3CFA3"
 """Tints of the line colours."""
 
@@ -123,6 +125,8 @@ def plot_states(result: Any, states: Sequence[str] | None = None, *, series: Any
                 width: str | float = "column") -> Figure:
     """Draw the posterior mean of each state with a 95% band, the forecast of it, and the truth where they are known.
 
+    The regimes of `lfm_ppl.Switching` share a panel with their probabilities, and a strip above of the true regime.
+
     Args:
         result: with the group trajectories, predictions of a forecast, and truth where it is known.
         states: names; None for all, up to 12.
@@ -130,7 +134,7 @@ def plot_states(result: Any, states: Sequence[str] | None = None, *, series: Any
         width: "column" (3.4 in), "full" (7 in), or inches.
 
     Returns:
-        A figure with one panel per state, and for each series of a panel.
+        A figure with one panel per state and one for all regimes, and for each series of a panel.
 
     Raises:
         ValueError: the result holds no state trajectories, or a state is unknown.
@@ -231,6 +235,8 @@ def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, series: 
     """Draw a panel for each force, state or deterministic, its mean and band in the two ``colours``."""
     draws = _trajectories(result, kind)
     names, note = style.first_of(pick(draws, kind, selection), selection, MAX_PANELS, f"{kind}s")
+    regimes = [name for name in json.loads(draws.attrs.get(REGIMES, "[]")) if name in names]
+    names = [name for name in names if name not in regimes] + [_PROBABILITY] * bool(regimes)
     parts, remark = recent_series(result, series, len(names))
     windows = {name: window for part in parts.values() for name, window in _season_windows(
         _trajectories(part, kind), forecasts.forecast_span(part)[1]).items()}
@@ -238,6 +244,9 @@ def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, series: 
     for axes, (name, (title, part)) in zip(panels, itertools.product(names, parts.items()), strict=True):
         predicted = forecasts.series_predictions(part)
         paths = None if predicted is None else predicted.get(f"{kind}s")
+        if regimes and name == _PROBABILITY:
+            _draw_regimes(axes, part, paths, regimes, title)
+            continue
         band = np.array(_band(part, kind, name))
         first, last = windows.get(name, (-np.inf, np.inf))
         time, mean, low, high = band[:, band[0] >= first]
@@ -253,6 +262,27 @@ def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, series: 
     periods = f"Of {', '.join(shortened)} {SHOWN_PERIODS} periods at the end of the data." if shortened else ""
     finish(figure, panels, result, f"{remark} {periods} {note}")
     return figure
+
+
+def _draw_regimes(axes: Axes, result: Any, paths: xr.DataArray | None, regimes: Sequence[str], title: str) -> None:
+    """Draw the probabilities of the regimes as areas, with their predictions (chain, draw, time, state) or None."""
+    probability = _trajectories(result, "state").sel(state=list(regimes)).mean(["chain", "draw"])
+    times = probability["at"].values
+    if paths is not None:
+        later = paths.sel(state=list(regimes), time=paths["time"] > times[-1]).mean(["chain", "draw"])
+        probability = xr.concat([probability, later.rename(time="at")], "at", coords="minimal", compat="override")
+        forecasts.mark_last_observation(axes, result)
+    colours = dict(zip(regimes, itertools.cycle(style.CHAIN_COLOURS), strict=False))
+    axes.stackplot(probability["at"].values, probability.transpose("state", "at").values, labels=regimes, lw=0,
+                   colors=colours.values(), alpha=0.6)
+    ticks = {0.0: "0", 0.5: "0.5", 1.0: "1"}
+    for regime, colour in colours.items():
+        truth = _true_path(axes, result, "state", regime)
+        if truth is not None:
+            axes.fill_between(truth[0], 1.05, 1.05 + 0.1 * truth[1], step="mid", color=colour, lw=0)
+            ticks[1.1] = "truth"
+    axes.set(ylim=(0.0, max(ticks) + 0.05 * (len(ticks) > 3)), ylabel=_PROBABILITY, title=title)
+    axes.set_yticks(list(ticks), list(ticks.values()))
 
 
 def _season_windows(draws: xr.DataArray, end: float) -> dict[str, tuple[float, float]]:
@@ -285,13 +315,19 @@ def _trajectories(result: Any, kind: str) -> xr.DataArray:
 
 def _draw_truth(axes: Axes, result: Any, kind: str, name: str) -> None:
     """Draw the true trajectory where it is known, as far as the axes are in use."""
+    truth = _true_path(axes, result, kind, name)
+    if truth is not None:
+        axes.plot(*truth, **style.TRUTH)
+
+
+def _true_path(axes: Axes, result: Any, kind: str, name: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return times and values of the true trajectory, as far as the axes are in use; None where it is unknown."""
     truth = group(result, "truth").get(f"{kind}s") if has_group(result, "truth") else None
     if truth is None or kind not in truth.dims or name not in truth[kind].values:
-        return
+        return None
     times, (low, high) = truth["at_truth"].values, axes.dataLim.intervalx
     is_shown = (times >= low) & (times <= high) | (low > high)  # nothing else is drawn yet
-    if is_shown.any():
-        axes.plot(times[is_shown], truth.sel({kind: name}).values[is_shown], **style.TRUTH)
+    return (times[is_shown], truth.sel({kind: name}).values[is_shown]) if is_shown.any() else None
 
 
 def _draw_output(axes: Axes, result: Any, name: str) -> None:
