@@ -81,7 +81,7 @@ top.legend(frameon=False, ncols=3)
 bottom.plot(times, smoothed.probability[:, 1], color="#D55E00", label="probability given all data")
 bottom.fill_between(times, np.asarray(path[:, 2]), step="mid", color="0.85", label="truth")
 bottom.set(xlabel="time (h)", ylabel="window open", ylim=(0, 1.05))
-_ = bottom.legend(frameon=False)
+_ = bottom.legend(frameon=False, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
 
 # %% [markdown]
@@ -180,7 +180,7 @@ durations.quantile([0.025, 0.5, 0.975]).round(2).rename_axis("mean duration (kyr
 #
 # As a check, onsets that the probability shows, where it crosses one half upwards, beside ages that were read from the
 # layers of the ice (Rasmussen and others, Quaternary Science Reviews 106, 2014). These count from the year 2000, 50
-# years more than the record's. A century is the resolution of the averages.
+# years more than the record's. A century is the resolution of the averages. Dotted lines mark the published ages.
 
 # %%
 KNOWN = {"GI-1": 14.69, "GI-3": 27.78, "GI-4": 28.90, "GI-8": 38.22, "GI-12": 46.86, "GI-14": 54.22}  # kyr b2k
@@ -189,6 +189,18 @@ at, probability = states["at"].to_numpy(), states.mean(("chain", "draw")).to_num
 is_onset = (probability[1:] >= 0.5) & (probability[:-1] < 0.5)
 onsets = 0.05 - 0.5 * (at[1:] + at[:-1])[is_onset]
 print(f"{len(onsets)} onsets, at {', '.join(f'{age:.2f}' for age in onsets)} kyr b2k")
+
+figure, (top, bottom) = plt.subplots(2, 1, figsize=(7, 3.4), sharex=True, layout="constrained")
+top.plot(ages, isotopes, color="k", lw=0.6)
+top.set(ylabel="d18O (permille)")
+bottom.plot(at, probability, color="#D55E00", lw=0.9)
+bottom.set(xlabel="time (kyr)", ylabel="probability of warm", ylim=(0, 1.02))
+for name, age in KNOWN.items():
+    for axis in (top, bottom):
+        axis.axvline(0.05 - age, color="#0072B2", lw=0.8, ls=":")
+    top.annotate(name, (0.05 - age, 1.0), xycoords=("data", "axes fraction"), rotation=90, ha="right", va="top",
+                 fontsize=7, color="#0072B2")
+plt.show()
 nearest = {name: onsets[np.abs(onsets - age).argmin()] if len(onsets) else np.nan for name, age in KNOWN.items()}
 pd.DataFrame({"published (kyr b2k)": KNOWN, "nearest onset": nearest}).assign(
     difference=lambda table: table["nearest onset"] - table["published (kyr b2k)"]).round(2)
