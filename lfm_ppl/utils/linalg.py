@@ -396,7 +396,9 @@ def pivoted_cholesky(p: jax.Array, rank: int) -> tuple[jax.Array, jax.Array]:
     tolerance = jax.lax.stop_gradient(p.shape[-1] * jnp.finfo(p.dtype).eps * diagonal(p).max())
 
     def eliminate(remainder: jax.Array, _: None) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        index = jnp.argmax(diagonal(remainder))
+        variances = diagonal(remainder)
+        # The first of several equal variances: rounding errors would choose another one for other parameters.
+        index = jnp.argmax(variances >= (1.0 - 1e-9) * variances.max())
         column = remainder[:, index]
         is_positive = column[index] > tolerance
         column = jnp.where(is_positive, column / jnp.sqrt(jnp.where(is_positive, column[index], 1.0)), 0.0)
