@@ -14,7 +14,7 @@ consists of the constant linear part of the dynamics and the forces.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,13 +40,16 @@ class LinearPart(NamedTuple):
 
 
 class Exact(NamedTuple):
-    """Transition of a linear time-invariant model over an interval: s -> phi s + offset + N(0, process_cov)."""
+    """Transition of a linear time-invariant model over an interval: s -> phi s + offset + N(0, process_cov).
+
+    ``half`` and ``full`` are E(h/2) and E(h) of a step, for an offset that is integrated; None where it is exact.
+    """
 
     phi: jax.Array
     process_cov: jax.Array
     offset: jax.Array
-    half: jax.Array
-    full: jax.Array
+    half: Any = None
+    full: Any = None
 
 
 class IntegratingFactor(NamedTuple):
@@ -114,7 +117,7 @@ def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPar
     discretise_forces = jax.vmap(ssm.stack.discretise) if is_block else ssm.stack.discretise
     if size == 0:
         phi, process_cov = discretise_forces(length)
-        return Exact(phi, process_cov, jnp.zeros(phi.shape[:-1]), phi, phi)
+        return Exact(phi, process_cov, jnp.zeros(phi.shape[:-1]))
     t = jnp.zeros(())
     linear = linear_part(ssm, t) if linear is None else linear
     matrix, shift = ssm.input_map(t)
@@ -130,7 +133,7 @@ def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPar
     forces, force_cov = discretise_forces(length)
     phi = phi.at[..., size:total, size:total].set(forces)
     process_cov = process_cov.at[..., size:total, size:total].set(force_cov) if size else process_cov
-    half = full = phi[..., :total, :total]
+    half = full = None
     if not ssm.mean_invariant:
         half, _ = discretise_joint(lin, jnp.zeros_like(lin), 0.5 * length / steps)
         full = matmul(half, half)

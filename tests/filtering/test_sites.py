@@ -360,8 +360,7 @@ def test_weighted_draws_of_the_smoother_estimate_the_evidence(name):
     """Against importance sampling by dense algebra, to five standard errors of both; also with negative precisions."""
     y = data(name)
     distribution = likelihood(name, THETA)
-    run = jax.jit(lambda key: importance_weights(distribution.ssm, distribution.rule, distribution.time_grid,
-                                                 jnp.asarray(y), key, 20_000, SiteSettings()))
+    run = jax.jit(lambda key: importance_weights(distribution.problem, jnp.asarray(y), key, 20_000, SiteSettings()))
     log_weights = np.asarray(run(jax.random.key(0)))
     result = distribution.smooth(y)
     cov = np.cov(np.asarray(result.sample(jax.random.key(0), 4000).forces["u"]).T) * 1.1
