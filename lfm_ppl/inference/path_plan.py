@@ -96,7 +96,7 @@ def _plan_of(series: SeriesLikelihood, times: np.ndarray, requested_times: np.nd
     if requested_times is None:
         return PathPlan(None, rows, rows, fine)
     beyond = np.array([])
-    needs_steps = simulated or not series.ssm.mean_invariant
+    needs_steps = simulated or not series.ssm.mean_invariant or len(series.ssms) > 1
     if needs_steps and requested_times.max() > times[-1] and (gaps > 0).any():
         gap = np.median(gaps[gaps > 0])
         count = min(int(np.ceil((requested_times.max() - times[-1]) / gap * (1 - 1e-12))), LONGEST_FORECAST)

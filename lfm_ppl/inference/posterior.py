@@ -61,7 +61,7 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *,
     """
 
     def score_series(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
-        return distribution.scores(y, key)._asdict()
+        return distribution.scores(key, y)
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         log_priors = {LOG_PRIOR + name: value for name, value in bound.site_log_priors(values, y).items()}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -47,20 +47,6 @@ FORWARD_MODE_LIMIT = 10
 
 _MANY_STATES = 12
 """Number of states of a linear time-invariant model above which its gradient is faster in reverse mode."""
-
-
-class RowScores(NamedTuple):
-    """Scores of the rows of the data.
-
-    Attributes:
-        leave_one_out: (T,), log p(y_k | y_-k).
-        one_step_ahead: (T,), log p(y_k | y_1:k-1).
-        residual: (T, D), whitened innovations, NaN where missing.
-    """
-
-    leave_one_out: jax.Array
-    one_step_ahead: jax.Array
-    residual: jax.Array
 
 
 class SeriesLikelihood(dist.Distribution):
@@ -257,10 +243,11 @@ class SeriesLikelihood(dist.Distribution):
         """Draw a path of a state that is not Gaussian: (x, u) (L, M + R), and its times (L,)."""
         raise NotImplementedError
 
-    def scores(self, y: jax.Array, key: jax.Array) -> RowScores:
-        """Return predictive densities and residuals of the rows of ``y`` (T, D); ``key`` is for random ones."""
+    def scores(self, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
+        """Return scores of the rows of ``y`` (T, D): "leave_one_out" and "one_step_ahead" (T,), "residual" (T, D)."""
         result = self.smooth(y)
-        return RowScores(self.leave_one_out(y, result), result.log_likelihood, result.whitened_innovation)
+        return {"leave_one_out": self.leave_one_out(y, result), "one_step_ahead": result.log_likelihood,
+                "residual": result.whitened_innovation}
 
     def leave_one_out(self, y: jax.Array, smoothed: SmootherResult) -> jax.Array:
         """Return (T,), log p(y_k | y_-k), given the result of `smooth`."""

@@ -26,7 +26,7 @@ from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
-from lfm_ppl.inference.series_likelihood import RowScores, SeriesLikelihood, repeat_draw
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.resolution import check_resolution
@@ -42,6 +42,7 @@ from lfm_ppl.switching.regimes import (
     merge,
     regime_transitions,
     sample_regimes,
+    simulate_regimes,
     smooth_path,
 )
 from lfm_ppl.switching.switched_model import SwitchedProblem
@@ -214,7 +215,7 @@ class Switching(SeriesLikelihood):
     def smooth(self, y: Any, at: Any = None, steps: int | None = None) -> Any:
         """Smooth: the probabilities of the regimes, and the state, given all observations.
 
-        Both are averages over 256 draws of the regimes, so that probabilities have errors of some 0.02.
+        Both are averages over 256 draws of the regimes, so that probabilities have standard errors of up to 0.03.
 
         Args:
             y: (T, D), NaN where missing.
@@ -241,7 +242,7 @@ class Switching(SeriesLikelihood):
             jnp.asarray(grid.requested_times, float), paths.probability[requested], *moments,
             trace.log_likelihood[jnp.asarray(grid.observed)], self.regime_names)
 
-    def scores(self, y: jax.Array, key: jax.Array) -> RowScores:
+    def scores(self, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
         """Return densities and residuals of the rows, with a path of regimes as a further parameter of the draw.
 
         The leave-one-out density is log p(y_k | y_-k, r), so that leave-one-out cross-validation weights the paths with
@@ -251,7 +252,8 @@ class Switching(SeriesLikelihood):
         trace = filter_regimes(regimes, y)
         path = sample_regimes(key, regimes, trace, 1).regime[:, 0]
         left_out = smooth_path(regimes, y, path).leave_one_out
-        return RowScores(left_out[observed], trace.log_likelihood[observed], trace.residual[observed])
+        return {"leave_one_out": left_out[observed], "one_step_ahead": trace.log_likelihood[observed],
+                "residual": trace.residual[observed]}
 
     def _grid(self, at: Any, steps: int | None = None) -> TimeGrid:
         return build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at)
@@ -269,9 +271,13 @@ class Switching(SeriesLikelihood):
         """
         grid = self.time_grid if at is None else self._grid(at)
         regimes = self.regimes(grid)
-        paths = sample_regimes(key, regimes, filter_regimes(regimes, y), 1)
+        # Merged states would leave the range of the regimes after the last row.
+        last = int(np.max(grid.observed)) + 1
+        trace = jax.tree.map(lambda a: a[:last], filter_regimes(regimes, y))
+        path_key, forecast_key = jax.random.split(key)
+        paths = sample_regimes(path_key, regimes, trace, 1)
         requested, times = jnp.asarray(grid.requested), jnp.asarray(grid.requested_times, float)
-        states, indices = paths.state[requested, 0], paths.regime[requested, 0]
+        states, indices = (a[requested] for a in simulate_regimes(forecast_key, regimes, paths))
         candidates = jnp.stack([jax.vmap(ssm.inputs)(states, times) for ssm in self.ssms])
         return self._with_indicators(candidates[indices, jnp.arange(len(times))], indices), times
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -53,12 +54,16 @@ def check_probabilities(probabilities: Any, count: int) -> jax.Array:
     value = checks.concrete(probabilities)
     if value is not None and (np.any(value < 0) or not np.isclose(value.sum(), 1.0)):
         raise ValueError(f"initial must hold probabilities that sum to 1, got {value.tolist()}.")
-    return jnp.asarray(probabilities, float)
+    probabilities = jnp.asarray(probabilities, float)
+    is_valid = (probabilities >= 0).all() & (jnp.abs(probabilities.sum() - 1.0) < 1e-6)
+    return jnp.where(is_valid, probabilities, jnp.nan)  # a density of -inf where they are traced
 
 
 def transition_matrices(rates: jax.Array, lengths: jax.Array) -> jax.Array:
     """Return the transition probabilities exp(rates dt) (N, K, K) over times ``lengths`` (N,)."""
-    probabilities = jnp.maximum(jax.vmap(lambda length: jax.scipy.linalg.expm(rates * length))(lengths), 0.0)
+    # Many squarings for rates that are fast compared with the data.
+    exponential = functools.partial(jax.scipy.linalg.expm, max_squarings=48)
+    probabilities = jnp.maximum(jax.vmap(lambda length: exponential(rates * length))(lengths), 0.0)
     return probabilities / probabilities.sum(-1, keepdims=True)
 
 

@@ -18,6 +18,7 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.state_space import state_space
 from lfm_ppl.switching.switched_model import check_structure
+from lfm_ppl.utils import checks
 
 
 def check_models(models: Any) -> dict[str, LatentForceModel]:
@@ -25,7 +26,8 @@ def check_models(models: Any) -> dict[str, LatentForceModel]:
 
     Raises:
         TypeError: not a mapping of names to latent force models.
-        ValueError: fewer than two; the models differ in states, forces, outputs or deterministics.
+        ValueError: fewer than two; the models differ in states, forces, outputs, deterministics or initial times; a
+            force has a mean that is a function of time.
     """
     if not isinstance(models, Mapping) or not all(isinstance(model, LatentForceModel) for model in models.values()):
         raise TypeError('models must map the names of the regimes to latent force models, {"calm": model1, "abrupt": '
@@ -35,7 +37,13 @@ def check_models(models: Any) -> dict[str, LatentForceModel]:
                          "lfm.MarginalLikelihood.")
     models = {str(name): model for name, model in models.items()}
     check_structure({f"the regime {name!r}": state_space(model) for name, model in models.items()})
+    initial_times = {name: model.initial_time for name, model in models.items()}
+    if not checks.traced(list(initial_times.values())) and len({str(time) for time in initial_times.values()}) > 1:
+        raise ValueError(f"the models of all regimes need one initial_time, got {initial_times}.")
     for name, model in models.items():
+        if any(callable(force.mean) for force in model.forces.values()):
+            raise ValueError(f"the mean of a force of the regime {name!r} is a function of time; add it to the "
+                             "dynamics.")
         if not isinstance(model.observation, GaussianObservation) or jnp.ndim(model.observation.covariance) == 3:
             raise ValueError(f"the regime {name!r} needs an lfm.GaussianObservation with one covariance for all rows, "
                              "because regimes are merged by the moments of the state.")
@@ -73,6 +81,7 @@ def joint_model(models: Mapping[str, LatentForceModel], probabilities: jax.Array
             select([functools.partial(model.observation.covariance_at, row=0) for model in members]),
             first.observation.angular),
         initial_state=initial,
+        process_noise=_joint_noise(members, size),
         initial_time=first.initial_time,
         state_names=(*first.state_names, *models),
         output_names=first.output_names,
@@ -80,3 +89,20 @@ def joint_model(models: Mapping[str, LatentForceModel], probabilities: jax.Array
         deterministics={name: select([model.deterministics[name] for model in members])
                         for name in first.deterministic_names},
     )
+
+
+def _joint_noise(members: Sequence[LatentForceModel], size: int) -> Callable[..., jax.Array] | None:
+    """Return the dispersion (M + K, S) with the columns of all regimes, zero where the indicator is; None without."""
+    if all(model.process_noise is None for model in members):
+        return None
+
+    def dispersion(x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
+        columns = []
+        for index, model in enumerate(members):
+            noise = model.process_noise
+            if noise is not None:
+                matrix = noise(x[:size], u, t) if callable(noise) else noise
+                columns.append(x[size + index] * jnp.pad(matrix, ((0, len(members)), (0, 0))))
+        return jnp.concatenate(columns, axis=1)
+
+    return dispersion

@@ -14,7 +14,7 @@ From the last interval to the first, for each of S draws of the later state s_k+
    from the merged states, and the smoother's gain gives the Gaussian of s_k in regime i. Both are drawn from this law.
 5. Given a path of regimes the model is that of one filter: its trace goes to the backward scan of the smoother.
 
-Draws are exact given the merged states of the filter.
+Draws are exact given the merged states of the filter. After the last observation regime and state are simulated.
 
 Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8), for IMM; Tugnait (1982), Automatica
 18(5), for GPB2; Carter and Kohn (1994), Biometrika 81(3), for the draws.
@@ -38,6 +38,7 @@ from lfm_ppl.filtering.problem import FilterProblem
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.switching.chain import transition_matrices
+from lfm_ppl.utils import checks
 from lfm_ppl.utils.gaussian_residuals import log_density
 from lfm_ppl.utils.linalg import cholesky, diagonal, semidefinite_root, solve_lower
 
@@ -147,6 +148,9 @@ def regime_transitions(rates: jax.Array, grid: TimeGrid) -> tuple[jax.Array, jax
         rates: (K, K), rows that sum to zero.
         grid: the time grid.
     """
+    if checks.traced((grid.intervals.observation, grid.observed)):
+        raise ValueError("times, or a lag of a known input, are traced values, but regimes need intervals that are "
+                         "known before compilation; give them as numbers.")
     is_end = np.asarray(grid.intervals.observation) >= 0
     is_end[max(grid.observed) + 1:] = True
     is_start = np.append(True, is_end[:-1])
@@ -198,8 +202,11 @@ def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[Regi
                               interval: Any = interval) -> tuple[FilterTrace, jax.Array]:
                 prediction = predict(problem, interval, source, record=record)
                 updated = update_at_end(problem, update, interval, row, prediction.moments)
-                trace = FilterTrace(None, updated.log_likelihood, prediction.moments, updated.moments, prediction.phi,
-                                    prediction.process_cov, updated._replace(moments=None, log_likelihood=None))
+                trace = FilterTrace(None, updated.log_likelihood, filtered=updated.moments)
+                if record is Record.SMOOTHER:
+                    trace = trace._replace(predicted=prediction.moments, phi=prediction.phi,
+                                           process_cov=prediction.process_cov,
+                                           update=updated._replace(moments=None, log_likelihood=None))
                 return trace, ndtr(updated.innovation / jnp.sqrt((updated.chol**2).sum(-1)))
 
             trace, distribution = jax.vmap(filter_source)(jax.tree.map(lambda a, j=j: a[j], sources.moments))
@@ -231,7 +238,10 @@ def _enter_regimes(filtered: RegimeMoments, transition: jax.Array, merging: str)
 
 
 def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace, draws: int) -> RegimePaths:
-    """Draw paths of state and regime given the observations."""
+    """Draw paths of state and regime given the observations, at the ends of the intervals of ``trace``.
+
+    It may end before the grid, which `simulate_regimes` goes on with.
+    """
     count, regime_count, size = trace.filtered.moments.mean.shape
     normals = jax.random.normal(key, (count, draws, size))
     gumbels = jax.random.gumbel(jax.random.fold_in(key, 1), (count, draws, regime_count))
@@ -254,9 +264,34 @@ def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace, d
                           end.moments.covariance[None], jnp.zeros(draws, int))
     last = draw(law, normals[-1], gumbels[-1])
     earlier = jax.tree.map(lambda a: a[:-1], (trace.filtered, normals, gumbels))
-    later = jax.tree.map(lambda a: a[1:], (regimes.transitions, regimes.intervals))
+    later = jax.tree.map(lambda a: a[1:count], (regimes.transitions, regimes.intervals))
     paths = jax.lax.scan(step, last, (earlier[0], *later, *earlier[1:]), reverse=True)[1]
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), paths, last)
+
+
+def simulate_regimes(key: jax.Array, regimes: RegimeProblem, paths: RegimePaths) -> tuple[jax.Array, jax.Array]:
+    """Continue one draw to the end of the grid: states (N, n) and regimes (N,).
+
+    In each interval the regime is drawn from the chain, and the state from the prediction of a known state.
+    """
+    first, size = paths.state.shape[0], paths.state.shape[-1]
+    count = regimes.transitions.shape[0] - first
+    normals = jax.random.normal(key, (count, size))
+    gumbels = jax.random.gumbel(jax.random.fold_in(key, 1), (count, len(regimes.problems)))
+
+    def step(previous: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
+        state, regime = previous
+        transition, intervals, normal, gumbel = inputs
+        regime = jnp.argmax(_log(transition[regime]) + gumbel)
+        moments = Moments(state, jnp.zeros((size, size)))
+        predicted = _stack([predict(problem, interval, moments).moments
+                            for problem, interval in zip(regimes.problems, intervals, strict=True)])
+        state = predicted.mean[regime] + matvec(semidefinite_root(predicted.covariance[regime]), normal)
+        return (state, regime), (state, regime)
+
+    inputs = *jax.tree.map(lambda a: a[first:], (regimes.transitions, regimes.intervals)), normals, gumbels
+    states, indices = jax.lax.scan(step, (paths.state[-1, 0], paths.regime[-1, 0]), inputs)[1]
+    return jnp.concatenate([paths.state[:, 0], states]), jnp.concatenate([paths.regime[:, 0], indices])
 
 
 def _law_given_later(regimes: RegimeProblem, filtered: RegimeMoments, transition: jax.Array,

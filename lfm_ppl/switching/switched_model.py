@@ -101,6 +101,7 @@ def check_structure(ssms: Mapping[str, StateSpaceModel]) -> None:
     """Raise ValueError unless the models, by their names in messages, differ in coefficients only."""
     first, *_ = names = list(ssms)
     structures = [{"states": ssm.model.state_names, "forces": ssm.model.force_names,
+                   "types of forces": [type(force).__name__ for force in ssm.model.force_list],
                    "outputs": ssm.model.output_names, "deterministics": ssm.model.deterministic_names,
                    "angular outputs": ssm.model.observation.angular, "a joint state of size": ssm.state_dim,
                    "jump times": ssm.stack.jump_times} for ssm in ssms.values()]

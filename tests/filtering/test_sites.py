@@ -161,9 +161,9 @@ def test_evidence_and_moments_of_many_records(name):
     away = away[away[:, 3] < 0.02]
     assert len(away) == 16 and away[:, 0].max() < 0.2 and away[:, 1].max() < 0.05
     if name == "Student-t":
-        assert np.median(away[:, 2]) < 0.015 and np.sum(away[:, 2] < 0.03) >= 14 and away[:, 2].max() < 0.07
+        assert np.median(away[:, 2]) < 0.03 and away[:, 2].max() < 0.16
     else:
-        assert away[:, 2].max() < 0.01
+        assert away[:, 2].max() < 0.025
 
 
 def differences(value, theta, h=1e-3):

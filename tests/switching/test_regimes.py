@@ -149,9 +149,9 @@ def test_equal_regimes_are_one_model(merging):
     smoothed, expected = switching.smooth(y, at), single.smooth(y, at)
     np.testing.assert_allclose(smoothed.mean, expected.mean, atol=1e-9)
     np.testing.assert_allclose(smoothed.covariance, expected.covariance, atol=1e-9)
-    scores = switching.scores(y, jax.random.key(0))
-    np.testing.assert_allclose(scores.leave_one_out, expected.leave_one_out, atol=1e-9)
-    np.testing.assert_allclose(scores.residual, expected.whitened_innovation, atol=1e-8)
+    scores = switching.scores(jax.random.key(0), y)
+    np.testing.assert_allclose(scores["leave_one_out"], expected.leave_one_out, atol=1e-9)
+    np.testing.assert_allclose(scores["residual"], expected.whitened_innovation, atol=1e-8)
 
 
 def test_requested_times_change_no_probability():
@@ -262,6 +262,35 @@ def test_nonlinear_regimes_are_linearised():
     np.testing.assert_allclose(switching.log_prob(y), single.log_prob(y), rtol=1e-9)
 
 
+@pytest.mark.parametrize("requested", [[5.0, 12.0], np.arange(3.5, 12.1, 0.5)])
+def test_forecasts_stay_in_the_range_of_the_regimes(requested):
+    """From a regime without noise about its level, the state moves between the levels, and ends at both."""
+    models = {name: build(1e-3, decay=2.0, level=level) for name, level in (("low", 0.0), ("high", 4.0))}
+    switching = lfm.Switching(models, 2 * RATES, np.arange(4.0), initial=[1.0, 0.0])
+    y = np.zeros((4, 1))
+    w, _ = jax.jit(jax.vmap(lambda key: switching.sample_path(key, y, requested)))(
+        jax.random.split(jax.random.key(0), 2000))
+    last = np.asarray(w[:, -1, 0])
+    assert -0.5 < last.min() and last.max() < 4.2
+    chain = scipy.linalg.expm(np.asarray(switching.rates) * 9.0)
+    np.testing.assert_allclose(w[:, -1, 2].mean(), chain[0, 1], atol=0.06)
+
+
+def test_known_inputs_of_any_regime_divide_the_intervals():
+    """The process noise of the second regime, which holds, has a step between two rows."""
+    step = lfm.Input([0.0, 2.5, 10.0], [0.3, 3.0, 3.0], "previous")
+
+    def model(noise):
+        return lfm.LatentForceModel(
+            lambda x, u, t: -x, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+            lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=noise)
+
+    times, y = np.arange(6.0), np.array([[0.1], [0.3], [-0.2], [2.0], [-1.0], [0.5]])
+    stepped = model(lambda x, u, t: jnp.reshape(step(t), (1, 1)))
+    switching = lfm.Switching({"a": model(jnp.ones((1, 1))), "b": stepped}, np.zeros((2, 2)), times, initial=[0.0, 1.0])
+    np.testing.assert_allclose(switching.log_prob(y), lfm.MarginalLikelihood(stepped, times).log_prob(y), rtol=1e-8)
+
+
 def regimes_model(times, y=None):
     leave = numpyro.sample("leave", dist.LogNormal(-1.5, 0.5))
     rates = jnp.array([[-1.0, 1.0], [1.0, -1.0]]) * leave
@@ -323,7 +352,7 @@ def test_rates_are_calibrated():
     ({"initial": [1.0]}, "2 probabilities"),
     ({"merging": "gpb1"}, "merging"),
     ({"models": {"a": build()}}, "at least two regimes"),
-    ({"models": {"a": build(), "b": known_state(0.0)}}, "other states, forces"),
+    ({"models": {"a": build(), "b": known_state(0.0)}}, "has forces"),
     ({"models": {"a": build(), "u": build()}}, "'u'"),
 ])
 def test_malformed_arguments_have_one_line(change, match):
@@ -331,6 +360,16 @@ def test_malformed_arguments_have_one_line(change, match):
     with pytest.raises(ValueError, match=match) as error:
         lfm.Switching(**arguments)
     assert "\n" not in str(error.value)
+
+
+def test_traced_probabilities_and_initial_times_are_checked():
+    times, y = np.arange(3.0), np.zeros((3, 1))
+    models = {"a": build(), "b": build()}
+    assert jax.jit(lambda p: lfm.Switching(models, RATES, times, initial=p).log_prob(y))(jnp.ones(2)) == -np.inf
+    early = lfm.LatentForceModel(lambda x, u, t: -x + u, {"u": lfm.Matern(1.0, 1.0, order=0)}, lfm.GaussianObservation(
+        lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), initial_time=-1.0)
+    with pytest.raises(ValueError, match="initial_time"):
+        lfm.Switching({"a": build(), "b": early}, RATES, times)
 
 
 def test_models_of_another_type_are_refused():
