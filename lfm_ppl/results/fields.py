@@ -6,6 +6,7 @@ as a lengthscale in space; they are then computed for each draw.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -55,6 +56,9 @@ def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any 
     trajectories = group(result, "trajectories")
     posterior = group(result, "posterior").sel(draw=trajectories["draw"]).transpose("chain", "draw", ...)
     parameters = {str(label): variable.values.reshape(-1, *variable.shape[2:]) for label, variable in posterior.items()}
+    count = posterior.sizes["chain"] * posterior.sizes["draw"]
+    for label, value in json.loads(result.attrs.get("fixed", "{}")).items():
+        parameters.setdefault(label, np.broadcast_to(value, (count, *np.shape(value))))
 
     def make(values: Mapping[str, Any]) -> Any:
         return field if hasattr(field, "weights") else field(values)

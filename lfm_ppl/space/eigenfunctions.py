@@ -79,18 +79,20 @@ class LaplaceBasis(eqx.Module):
         """Return phi_j (P, J) at places (P,) or (P, d).
 
         Raises:
-            ValueError: a place lies outside of the domain. Inside of compiled code there is no check.
+            ValueError: a place lies outside of the domain; inside of compiled code its functions are NaN.
         """
         positions, (low, high) = position_array(points, len(self.domain)), np.transpose(self.domain)
         xp = jnp if checks.traced(positions) else np
-        if xp is np and (distance := (np.abs(positions - 0.5 * (low + high)) / (high - low)).max(1)).max() > 0.5000001:
-            index = distance.argmax()
+        is_outside = (xp.abs(positions - 0.5 * (low + high)) / (high - low)).max(1) > 0.5000001
+        if xp is np and is_outside.any():
+            index = is_outside.argmax()
             raise ValueError(f"points[{index}] = {positions[index].tolist()} lies outside of the domain {self.domain}.")
         orders, wavenumbers = _orders_and_wavenumbers(self)
         angles = wavenumbers * (positions - low)[:, None, :]
         is_sine = (orders > 0) & (orders % 2 == 0 if self.boundary == "periodic" else self.boundary == "dirichlet")
         amplitudes = np.sqrt(np.where(orders == 0, 1.0, 2.0) / (high - low))
-        return (amplitudes * xp.where(is_sine, xp.sin(angles), xp.cos(angles))).prod(-1)
+        values = (amplitudes * xp.where(is_sine, xp.sin(angles), xp.cos(angles))).prod(-1)
+        return xp.where(is_outside[:, None], np.nan, values)
 
     def weights(self, points: ArrayLike) -> tuple[Any, Any]:
         """Return the weights (P, J) of the coefficients in the field at places, and the variance beyond them, zero."""

@@ -116,7 +116,7 @@ def _model(source: Any, equation: Callable, state_names: Sequence[str], sensors:
     functions = None if callable(sensors) else basis.functions(sensors)
 
     def readings(x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
-        matrix = basis.functions(sensors(t)) if functions is None else functions
+        matrix = basis.functions(jnp.asarray(sensors(t))) if functions is None else functions
         return matrix @ x[:len(basis.names)]
 
     outputs = jax.eval_shape(readings, jnp.zeros(size), jnp.zeros(0), jnp.zeros(())).shape[0]

@@ -50,6 +50,13 @@ def test_moments_are_those_of_the_draws_with_their_parameters(result):
     np.testing.assert_allclose(evaluated["truth"].values[::2], true, atol=1e-12)
 
 
+def test_fixed_parameters_are_those_of_the_fit(result):
+    fixed = build({"posterior": result["posterior"].to_dataset().rename(scale="decay"),
+                   "trajectories": result["trajectories"].to_dataset()}, {"fixed": '{"scale": 0.7}'})
+    expected = lfm.evaluate_field(fixed, source({"scale": 0.7}), [0.3])
+    np.testing.assert_allclose(lfm.evaluate_field(fixed, source, [0.3])["mean"], expected["mean"], atol=1e-12)
+
+
 def test_the_sd_contains_the_variance_beyond_the_forces(result):
     place = np.array([[5.0, 5.0]])  # far from the points
     evaluated = lfm.evaluate_field(result, separable, place)

@@ -176,6 +176,9 @@ def test_sensors_may_move():
     assert float(lfm.MarginalLikelihood(moving, TIMES).log_prob(y)) == pytest.approx(float(expected), abs=1e-9)
     assert simulate(jax.random.key(0), moving, TIMES).y.shape == (5, 1)
     assert still.output_names[-1] == "sensor 4"
+    outside = equation("heat", "dirichlet", 1, sensors=lambda t: [0.1 + 10.0 * t])[2]
+    with pytest.warns(lfm.FilterWarning):
+        assert lfm.MarginalLikelihood(outside, TIMES).log_prob(y) == -np.inf
 
 
 @pytest.mark.parametrize("kind", ["heat", "wave"])
