@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
-from lfm_ppl.results.arviz_data import add_group, build, groups
+from lfm_ppl.results.arviz_data import add_group, build, group, groups
 from lfm_ppl.results.fields import add_fields
 from lfm_ppl.results.plots import save_figures
 
@@ -51,8 +51,8 @@ def test_moments_are_those_of_the_draws_with_their_parameters(result):
 
 
 def test_fixed_parameters_are_those_of_the_fit(result):
-    fixed = build({"posterior": result["posterior"].to_dataset().rename(scale="decay"),
-                   "trajectories": result["trajectories"].to_dataset()}, {"fixed": '{"scale": 0.7}'})
+    fixed = build({"posterior": group(result, "posterior").rename(scale="decay"),
+                   "trajectories": group(result, "trajectories")}, {"fixed": '{"scale": 0.7}'})
     expected = lfm.evaluate_field(fixed, source({"scale": 0.7}), [0.3])
     np.testing.assert_allclose(lfm.evaluate_field(fixed, source, [0.3])["mean"], expected["mean"], atol=1e-12)
 
@@ -92,4 +92,4 @@ def test_malformed_input(result):
     with pytest.raises(ValueError, match="field_heat"):
         lfm.plot_field(result, "heat")
     with pytest.raises(ValueError, match="trajectories"):
-        lfm.evaluate_field(add_group(build({}), "posterior", result["posterior"].to_dataset()), BASIS)
+        lfm.evaluate_field(add_group(build({}), "posterior", group(result, "posterior")), BASIS)
