@@ -26,6 +26,7 @@ from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -49,9 +50,6 @@ from lfm_ppl.switching.switched_model import SwitchedProblem
 from lfm_ppl.switching.switched_simulation import simulate_paths
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
-
-SIMULATION_STEPS = 5
-"""Steps of the simulator for one integration step of the filter."""
 
 SMOOTHER_DRAWS = 256
 """Draws of regimes over which the smoother averages; they have the same random numbers in each call."""
