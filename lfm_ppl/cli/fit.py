@@ -77,11 +77,11 @@ def run(name: str, options: FitArguments, line: Sequence[str]) -> int:
                 attributes=result_attributes(options, line, model, observed, model_options),
                 **sampling_arguments(options, model))
             partial = arviz_data.attributes(posterior).get("partial")
-            add_fields(posterior, fields)
             # The report is written last: without it the run was killed while it drew its figures.
             if is_finished and partial is None and (folder / html_report.NAME).is_file():
                 print(f"\nthe run in {folder} is complete; nothing was changed")
                 return 0
+            add_fields(posterior, fields)
             status = report(posterior, folder, time.perf_counter() - start_time, output.overwrite or output.resume)
         if partial is None:
             return status
