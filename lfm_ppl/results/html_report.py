@@ -56,7 +56,8 @@ _NOT_SETTINGS = ("model", "model_file", "description", "data", "note", "warnings
 """Attributes that stand in other sections, or that only programs read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"
-                    r"|field-.+\.(png|pdf|svg)|(forecast-)?(fit|inputs|forces|deterministics|states|trace|pairs|residuals|accuracy|forecast)"
+                    r"|field-.+\.(png|pdf|svg)"
+                    r"|(forecast-)?(fit|inputs|forces|deterministics|states|trace|pairs|residuals|accuracy|forecast)"
                     r"(-\d+)?\.(png|pdf|svg))")
 """Files of a result; other files in a folder are not linked."""
 

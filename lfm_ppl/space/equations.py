@@ -23,7 +23,7 @@ def heat(source: SpectralField | LaplaceBasis, diffusivity: ArrayLike, decay: Ar
          initial: Gaussian | None = None, **options: Any) -> LatentForceModel:
     r"""Return the heat equation with an unknown source, ``x_t = diffusivity laplacian x - decay x + s(r, t)``.
 
-    The states are the coefficients of x in the basis, "mode 0", "mode 1", ...; the forces u_j are those of the source:
+    The states are the coefficients of x in the basis, "mode 0", "mode 1", ...; the source has the forces u_j:
 
         c_j' = -(diffusivity w_j^2 + decay) c_j + sqrt(S(w_j)) u_j,    y_k = sum_j phi_j(r_k) c_j(t) + noise.
 
@@ -65,7 +65,7 @@ def wave(source: SpectralField | LaplaceBasis, speed: ArrayLike, damping: ArrayL
     r"""Return the wave equation with an unknown source, ``x_tt = speed^2 laplacian x - damping x_t + s(r, t)``.
 
     The states are the coefficients of the basis, "mode 0", "mode 1", ..., and then their rates of change, "rate of
-    mode 0", ...; the forces are those of the source:
+    mode 0", ...; the source has the forces u_j:
 
         c_j'' = -speed^2 w_j^2 c_j - damping c_j' + sqrt(S(w_j)) u_j.
 
@@ -110,7 +110,7 @@ def _basis(source: Any) -> LaplaceBasis:
 
 def _model(source: Any, equation: Callable, state_names: Sequence[str], sensors: Any, noise: Any,
            initial: Gaussian | None, options: dict[str, Any]) -> LatentForceModel:
-    """Return the model of an equation, from coefficients x and those of the source to the rates of change of x."""
+    """Return the model of an equation, a map from coefficients and source to rates of change."""
     basis, size, has_source = _basis(source), len(state_names), isinstance(source, SpectralField)
     amplitudes = source.amplitudes if has_source else 0.0
     functions = None if callable(sensors) else basis.functions(sensors)
