@@ -2,14 +2,14 @@
 
 1. `matmul` multiplies small matrices by broadcasting and summation, and selection matrices by slices; `congruence` and
    `outer_square` return exactly symmetric products.
-2. `cholesky` factorises a positive semi-definite matrix by unrolled Gaussian elimination, which also gives L^-1.
+2. `cholesky` factorises a positive semi-definite matrix by Gaussian elimination, which also gives L^-1.
    LAPACK's routine is an opaque call for XLA, and fails for singular matrices.
 3. A pivot at or below its floor is replaced by the floor, or its column by zero, so that values and derivatives are
    finite for singular matrices.
 4. `SemidefiniteFactor` scales a matrix to unit diagonal first, so that one relative tolerance serves all units.
 5. Products and factorisations have derivatives in closed form (custom_jvp), with fewer operations than the
    differentiated algorithm.
-6. Matrices larger than `_FUSED_SIZE` use XLA's dot and loops over columns, which keeps compilation short.
+6. Smaller matrices than `_FUSED_SIZE` are unrolled; larger ones use XLA's dot and loops, which keeps compilation short.
 
 Source: Golub and Van Loan (2013), Matrix Computations, chapter 4; Higham (2002), Accuracy and Stability of Numerical
 Algorithms, chapter 10.
@@ -131,20 +131,20 @@ class CholeskyFactor(NamedTuple):
     Attributes:
         chol: (n, n), lower triangular.
         degenerate: (n,), True where the pivot was at or below its floor.
-        inverse: (n, n), ``L^-1``, with a zero row where the diagonal of ``L`` is zero; None for a large matrix.
+        inverse: (n, n), ``L^-1``, with a zero row where the diagonal of ``L`` is zero.
     """
 
     chol: jax.Array
     degenerate: Any
-    inverse: Any = None
+    inverse: jax.Array
 
     def solve_lower(self, b: jax.Array) -> jax.Array:
         """Solve ``L X = B`` for ``B`` (n, m), as `solve_lower`."""
-        return solve_lower(self.chol, b) if self.inverse is None else matmul(self.inverse, b)
+        return matmul(self.inverse, b)
 
     def solve_upper(self, b: jax.Array) -> jax.Array:
         """Solve ``L' X = B`` for ``B`` (n, m), as `solve_upper`."""
-        return solve_upper(self.chol, b) if self.inverse is None else matmul(self.inverse.T, b)
+        return matmul(self.inverse.T, b)
 
 
 def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True,
@@ -165,9 +165,7 @@ def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True,
     if size == 0:
         return CholeskyFactor(p, jnp.zeros(0, bool), p)
     floor = jnp.broadcast_to(jnp.asarray(floor, p.dtype), (size,))
-    if size > _FUSED_SIZE:
-        return _cholesky_by_columns(p, floor, keep)
-    factor = _cholesky_unrolled(name, p, floor)
+    factor = _eliminate(name, p, floor)
     if keep:
         return factor
     degenerate = factor.degenerate
@@ -176,42 +174,48 @@ def cholesky(p: jax.Array, floor: jax.Array | float = 0.0, keep: bool = True,
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _cholesky_unrolled(name: str | None, p: jax.Array, floor: jax.Array) -> CholeskyFactor:
+def _eliminate(name: str | None, p: jax.Array, floor: jax.Array) -> CholeskyFactor:
     """Factorise with replaced pivots, by Gaussian elimination in (P, I), which becomes (L', L^-1) row by row."""
     size = p.shape[-1]
     if size == 1:
         is_positive = p > floor
         root = jnp.sqrt(jnp.where(is_positive, p, jnp.where(floor > 0, floor, 1.0)))
         return CholeskyFactor(root, ~is_positive[0], 1.0 / root)
-    rows = np.arange(size)
-    remainder = jnp.concatenate([p, jnp.eye(size, dtype=p.dtype)], axis=1)
-    factor_rows, degenerate = [], []
-    for j in range(size):
+    rows, columns = np.arange(size), np.arange(2 * size)
+
+    def eliminate(remainder: jax.Array, pivot_input: tuple) -> tuple[jax.Array, tuple]:
+        j, pivot_floor = pivot_input
         pivot = remainder[j, j]
-        is_positive = pivot > floor[j]
-        degenerate.append(~is_positive)
-        root = jnp.sqrt(jnp.where(is_positive, pivot, jnp.where(floor[j] > 0, floor[j], 1.0)))
+        is_positive = pivot > pivot_floor
+        root = jnp.sqrt(jnp.where(is_positive, pivot, jnp.where(pivot_floor > 0, pivot_floor, 1.0)))
         row = remainder[j] / root
         # A degenerate column of L is zero below its diagonal.
-        factor_row = jnp.where(is_positive | (np.arange(2 * size) >= size), row, 0.0)
-        factor_rows.append(jnp.where(np.arange(2 * size) == j, root, factor_row))
-        if j + 1 < size:
-            column = jnp.where(is_positive & (rows > j), remainder[:, j] / root, 0.0)
-            remainder = remainder - column[:, None] * row[None, :]
-    factor_and_inverse = jnp.stack(factor_rows)
-    return CholeskyFactor(jnp.where(rows[:, None] >= rows, factor_and_inverse[:, :size].T, 0.0), jnp.stack(degenerate),
-                          factor_and_inverse[:, size:])
+        factor_row = jnp.where(columns == j, root, jnp.where(is_positive | (columns >= size), row, 0.0))
+        column = jnp.where(is_positive & (rows > j), remainder[:, j] / root, 0.0)
+        return remainder - column[:, None] * row[None, :], (factor_row, ~is_positive)
+
+    remainder = jnp.concatenate([p, jnp.eye(size, dtype=p.dtype)], axis=1)
+    if size > _FUSED_SIZE:
+        factor_rows, degenerate = jax.lax.scan(eliminate, remainder, (jnp.arange(size), floor))[1]
+    else:
+        steps = []
+        for j in range(size):
+            remainder, step = eliminate(remainder, (j, floor[j]))
+            steps.append(step)
+        factor_rows, degenerate = (jnp.stack(values) for values in zip(*steps, strict=True))
+    return CholeskyFactor(jnp.where(rows[:, None] >= rows, factor_rows[:, :size].T, 0.0), degenerate,
+                          factor_rows[:, size:])
 
 
-@functools.partial(_cholesky_unrolled.defjvp, symbolic_zeros=True)
-def _cholesky_unrolled_jvp(name: str | None, primals: tuple, tangents: tuple) -> tuple[CholeskyFactor, CholeskyFactor]:
+@functools.partial(_eliminate.defjvp, symbolic_zeros=True)
+def _eliminate_jvp(name: str | None, primals: tuple, tangents: tuple) -> tuple[CholeskyFactor, CholeskyFactor]:
     """Differentiate in closed form: dL = L F and d(L^-1) = -F L^-1, where F is the lower half of L^-1 dP L^-T.
 
     A degenerate column of F is zero, except for the relative change of the floor that replaces the pivot.
     """
     p, floor = primals
     p_tangent, floor_tangent = tangents
-    factor = _cholesky_unrolled(name, p, floor)
+    factor = _eliminate(name, p, floor)
     if name is not None:  # here and not in the primal, since only a derivative has something to store
         factor = jax.tree_util.tree_map(lambda a: checkpoint_name(a, name), factor)
     chol, degenerate, inverse = factor
@@ -226,25 +230,6 @@ def _cholesky_unrolled_jvp(name: str | None, primals: tuple, tangents: tuple) ->
         lower = lower + jnp.diag(jnp.where(has_floor, 0.5 * floor_tangent / jnp.where(has_floor, floor, 1.0), 0.0))
     return factor, CholeskyFactor(matmul(chol, lower), np.zeros(degenerate.shape, jax.dtypes.float0),
                                   -matmul(lower, inverse))
-
-
-def _cholesky_by_columns(p: jax.Array, floor: jax.Array, keep: bool) -> CholeskyFactor:
-    """Factorise as `cholesky` does, in a loop over columns whose outer products are subtracted from the matrix."""
-    rows = np.arange(p.shape[-1])
-
-    def eliminate(remainder: jax.Array, pivot_input: tuple) -> tuple[jax.Array, tuple]:
-        j, pivot_floor = pivot_input
-        column = remainder[:, j]
-        pivot = column[j]
-        is_positive = pivot > pivot_floor
-        root = jnp.sqrt(jnp.where(is_positive, pivot, jnp.where(pivot_floor > 0, pivot_floor, 1.0)))
-        diagonal_entry = root if keep else jnp.where(is_positive, root, 0.0)
-        subdiagonal = jnp.where(is_positive, column / root, 0.0)
-        column = jnp.where(rows > j, subdiagonal, jnp.where(rows == j, diagonal_entry, 0.0))
-        return remainder - column[:, None] * column[None, :], (column, ~is_positive)
-
-    _, (columns, degenerate) = jax.lax.scan(eliminate, p, (jnp.arange(p.shape[-1]), floor))
-    return CholeskyFactor(columns.T, degenerate)
 
 
 def solve_lower(chol: jax.Array, b: jax.Array) -> jax.Array:
