@@ -43,7 +43,7 @@ from lfm_ppl.switching.regimes import (
     merge,
     regime_transitions,
     sample_regimes,
-    simulate_regimes,
+    sample_states,
     smooth_path,
 )
 from lfm_ppl.switching.switched_model import SwitchedProblem
@@ -228,16 +228,16 @@ class Switching(SeriesLikelihood):
     def _smooth(self, y: jax.Array, grid: TimeGrid) -> RegimeSmootherResult:
         regimes, requested = self.regimes(grid), jnp.asarray(grid.requested)
         trace = filter_regimes(regimes, y)
-        paths = sample_regimes(jax.random.key(0), regimes, trace, SMOOTHER_DRAWS)
+        paths, probability = sample_regimes(jax.random.key(0), regimes, trace, SMOOTHER_DRAWS)
 
         def smooth(path: jax.Array) -> Moments:
             # The nodes of the smoother begin with the initial time.
             return jax.tree.map(lambda a: a[requested + 1], smooth_path(regimes, y, path).moments)
 
         equal = jnp.ones(SMOOTHER_DRAWS)
-        moments = jax.vmap(lambda row: merge(equal, row), in_axes=1)(jax.vmap(smooth)(paths.regime.T))
+        moments = jax.vmap(lambda row: merge(equal, row), in_axes=1)(jax.vmap(smooth)(paths.T))
         return RegimeSmootherResult(
-            jnp.asarray(grid.requested_times, float), paths.probability[requested], *moments,
+            jnp.asarray(grid.requested_times, float), probability[requested], *moments,
             trace.log_likelihood[jnp.asarray(grid.observed)], self.regime_names)
 
     def scores(self, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
@@ -248,7 +248,7 @@ class Switching(SeriesLikelihood):
         """
         regimes, observed = self.regimes(), jnp.asarray(self.time_grid.observed)
         trace = filter_regimes(regimes, y)
-        path = sample_regimes(key, regimes, trace, 1).regime[:, 0]
+        path = sample_regimes(key, regimes, trace, 1)[0][:, 0]
         left_out = smooth_path(regimes, y, path).leave_one_out
         return {"leave_one_out": left_out[observed], "one_step_ahead": trace.log_likelihood[observed],
                 "residual": trace.residual[observed]}
@@ -268,14 +268,11 @@ class Switching(SeriesLikelihood):
             (x, indicators of the regimes, u) (L, M + K + R), and the times (L,).
         """
         grid = self.time_grid if at is None else self._grid(at)
-        regimes = self.regimes(grid)
-        # Merged states would leave the range of the regimes after the last row.
-        last = int(np.max(grid.observed)) + 1
-        trace = jax.tree.map(lambda a: a[:last], filter_regimes(regimes, y))
-        path_key, forecast_key = jax.random.split(key)
-        paths = sample_regimes(path_key, regimes, trace, 1)
-        requested, times = jnp.asarray(grid.requested), jnp.asarray(grid.requested_times, float)
-        states, indices = (a[requested] for a in simulate_regimes(forecast_key, regimes, paths))
+        regimes, requested = self.regimes(grid), jnp.asarray(grid.requested)
+        path_key, state_key = jax.random.split(key)
+        path = sample_regimes(path_key, regimes, filter_regimes(regimes, y), 1)[0][:, 0]
+        states = sample_states(state_key, regimes, y, path)[requested]
+        indices, times = path[requested], jnp.asarray(grid.requested_times, float)
         candidates = jnp.stack([jax.vmap(ssm.inputs)(states, times) for ssm in self.ssms])
         return self._with_indicators(candidates[indices, jnp.arange(len(times))], indices), times
 

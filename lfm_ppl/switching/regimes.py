@@ -12,9 +12,9 @@ From the last interval to the first, for each of S draws of the later state s_k+
 
 4. p(r_k = i | s_k+1, j, y) is proportional to p(r_k = i | y_1:k) P_ij N(s_k+1; m_ij, P_ij), with the predictions (i, j)
    from the merged states, and the smoother's gain gives the Gaussian of s_k in regime i. Both are drawn from this law.
-5. Given a path of regimes the model is that of one filter: its trace goes to the backward scan of the smoother.
-
-Draws are exact given the merged states of the filter. After the last observation regime and state are simulated.
+   After the last observation the chain is simulated.
+5. Given a path of regimes the model is that of one filter: its trace goes to the backward scan of the smoother, and
+   draws of the state are exact.
 
 Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8), for IMM; Tugnait (1982), Automatica
 18(5), for GPB2; Carter and Kohn (1994), Biometrika 81(3), for the draws.
@@ -22,6 +22,7 @@ Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8)
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -33,8 +34,9 @@ from jax.scipy.special import logsumexp, ndtr, ndtri
 from lfm_ppl.filtering.backward import SmootherTrace, backward
 from lfm_ppl.filtering.forward import FilterTrace, predict, update_at_end
 from lfm_ppl.filtering.intervals import TimeGrid, as_arrays, with_observations
-from lfm_ppl.filtering.moments import Moments, Record, matvec
+from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import FilterProblem
+from lfm_ppl.filtering.sample import sample_errors
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.switching.chain import transition_matrices
@@ -96,36 +98,6 @@ class RegimeTrace(NamedTuple):
     log_likelihood: jax.Array
     filtered: RegimeMoments
     residual: jax.Array
-
-
-class RegimePaths(NamedTuple):
-    """Output of `sample_regimes`, a row for each of the N intervals; S draws.
-
-    Attributes:
-        state: (N, S, n), draws of the state.
-        regime: (N, S), draws of the regime, an index.
-        probability: (N, K), of the regimes, given all observations.
-    """
-
-    state: jax.Array
-    regime: jax.Array
-    probability: jax.Array
-
-
-class _ConditionalLaw(NamedTuple):
-    """Law of regime and state given draws of later ones: sum_i weight_i N(mean_i, covariance[group]_i).
-
-    Attributes:
-        weight: (S, K).
-        mean: (S, K, n).
-        covariance: (G, K, n, n).
-        group: (S,), index of the covariance of a draw.
-    """
-
-    weight: jax.Array
-    mean: jax.Array
-    covariance: jax.Array
-    group: jax.Array
 
 
 def merge(weights: jax.Array, moments: Moments) -> Moments:
@@ -197,20 +169,16 @@ def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[Regi
         sources = jax.tree.map(lambda a, b: jnp.where(is_start, a, b), entering, sources)
         traces, distributions = [], []
         for j, (problem, update, interval) in enumerate(zip(regimes.problems, updates, intervals, strict=True)):
-
-            def filter_source(source: Moments, problem: Any = problem, update: Any = update,
-                              interval: Any = interval) -> tuple[FilterTrace, jax.Array]:
-                prediction = predict(problem, interval, source, record=record)
-                updated = update_at_end(problem, update, interval, row, prediction.moments)
-                trace = FilterTrace(None, updated.log_likelihood, filtered=updated.moments)
-                if record is Record.SMOOTHER:
-                    trace = trace._replace(predicted=prediction.moments, phi=prediction.phi,
-                                           process_cov=prediction.process_cov,
-                                           update=updated._replace(moments=None, log_likelihood=None))
-                return trace, ndtr(updated.innovation / jnp.sqrt((updated.chol**2).sum(-1)))
-
-            trace, distribution = jax.vmap(filter_source)(jax.tree.map(lambda a, j=j: a[j], sources.moments))
+            source = Moments(sources.moments.mean[j], sources.moments.covariance[j])
+            prediction = jax.vmap(functools.partial(predict, problem, interval, record=record))(source)
+            updated = jax.vmap(functools.partial(update_at_end, problem, update, interval, row))(prediction.moments)
+            trace = FilterTrace(None, updated.log_likelihood, filtered=updated.moments)
+            if record is Record.SMOOTHER:
+                trace = trace._replace(predicted=prediction.moments, phi=prediction.phi,
+                                       process_cov=prediction.process_cov,
+                                       update=updated._replace(moments=None, log_likelihood=None))
             traces.append(trace)
+            distribution = ndtr(updated.innovation / jnp.sqrt((updated.chol**2).sum(-1)))
             distributions.append(sources.probability[j] @ distribution)
         trace = _stack(traces)
         log_weight = _log(sources.probability) + trace.log_likelihood
@@ -237,82 +205,64 @@ def _enter_regimes(filtered: RegimeMoments, transition: jax.Array, merging: str)
     return RegimeMoments(joint.sum(1, keepdims=True), jax.tree.map(lambda a: a[:, None], merged))
 
 
-def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace, draws: int) -> RegimePaths:
-    """Draw paths of state and regime given the observations, at the ends of the intervals of ``trace``.
+def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace,
+                   draws: int) -> tuple[jax.Array, jax.Array]:
+    """Draw paths of regimes given the observations.
 
-    It may end before the grid, which `simulate_regimes` goes on with.
+    Returns:
+        The paths (N, S) and the probabilities (N, K) of the regimes, at the ends of the intervals.
     """
-    count, regime_count, size = trace.filtered.moments.mean.shape
-    normals = jax.random.normal(key, (count, draws, size))
-    gumbels = jax.random.gumbel(jax.random.fold_in(key, 1), (count, draws, regime_count))
+    filtered, last = trace.filtered, max(regimes.grid.observed)
+    keys = jax.random.split(key, (len(trace.log_likelihood), draws))
 
-    def draw(law: _ConditionalLaw, normal: jax.Array, gumbel: jax.Array) -> RegimePaths:
-        root = jax.vmap(jax.vmap(semidefinite_root))(law.covariance)
-        regime = jnp.argmax(_log(law.weight) + gumbel, axis=1)
-        state = law.mean[jnp.arange(draws), regime] + matvec(root[law.group, regime], normal)
-        return RegimePaths(state, regime, law.weight.mean(0))
+    def step(later: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
+        filtered, transition, intervals, keys = inputs
+        predictions = []
+        for problem, interval in zip(regimes.problems, intervals, strict=True):
+            predict_source = functools.partial(predict, problem, interval, record=Record.SMOOTHER)
+            predicted = jax.vmap(predict_source)(filtered.moments)
+            kernel = jax.vmap(smoothing_kernel)(filtered.moments, predicted.moments, predicted.phi,
+                                                predicted.process_cov)
+            predictions.append((predicted.moments, kernel.gain, jax.vmap(semidefinite_root)(kernel.conditional)))
+        joint = (filtered.probability[:, None] * transition).T, _stack(predictions)
 
-    def step(later: RegimePaths, inputs: tuple) -> tuple[RegimePaths, RegimePaths]:
-        filtered, transition, intervals, normal, gumbel = inputs
-        law = _law_given_later(regimes, filtered, transition, intervals, later)
-        paths = draw(law, normal, gumbel)
-        return paths, paths
+        def draw(key: jax.Array, state: jax.Array, regime: jax.Array) -> tuple[tuple, jax.Array]:
+            weights, (predicted, gain, root) = jax.tree.map(lambda a: a[regime], joint)
+            probability = _source_probabilities(weights, predicted, state)
+            source_key, state_key = jax.random.split(key)
+            source = jax.random.categorical(source_key, _log(probability))
+            mean = filtered.moments.mean[source] + gain[source] @ (state - predicted.mean[source])
+            return (mean + root[source] @ jax.random.normal(state_key, mean.shape), source), probability
 
-    end = jax.tree.map(lambda a: a[-1], trace.filtered)
-    law = _ConditionalLaw(jnp.broadcast_to(end.probability, (draws, regime_count)),
-                          jnp.broadcast_to(end.moments.mean, (draws, regime_count, size)),
-                          end.moments.covariance[None], jnp.zeros(draws, int))
-    last = draw(law, normals[-1], gumbels[-1])
-    earlier = jax.tree.map(lambda a: a[:-1], (trace.filtered, normals, gumbels))
-    later = jax.tree.map(lambda a: a[1:count], (regimes.transitions, regimes.intervals))
-    paths = jax.lax.scan(step, last, (earlier[0], *later, *earlier[1:]), reverse=True)[1]
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), paths, last)
+        earlier, probability = jax.vmap(draw)(keys, *later)
+        return earlier, (earlier[1], probability.mean(0))
 
+    def draw_last(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        regime_key, state_key = jax.random.split(key)
+        regime = jax.random.categorical(regime_key, _log(filtered.probability[last]))
+        root = semidefinite_root(filtered.moments.covariance[last, regime])
+        mean = filtered.moments.mean[last, regime]
+        return mean + root @ jax.random.normal(state_key, mean.shape), regime
 
-def simulate_regimes(key: jax.Array, regimes: RegimeProblem, paths: RegimePaths) -> tuple[jax.Array, jax.Array]:
-    """Continue one draw to the end of the grid: states (N, n) and regimes (N,).
+    def simulate(regime: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        transition, keys = inputs
+        regime = jax.vmap(jax.random.categorical)(keys, _log(transition[regime]))
+        return regime, regime
 
-    In each interval the regime is drawn from the chain, and the state from the prediction of a known state.
-    """
-    first, size = paths.state.shape[0], paths.state.shape[-1]
-    count = regimes.transitions.shape[0] - first
-    normals = jax.random.normal(key, (count, size))
-    gumbels = jax.random.gumbel(jax.random.fold_in(key, 1), (count, len(regimes.problems)))
-
-    def step(previous: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
-        state, regime = previous
-        transition, intervals, normal, gumbel = inputs
-        regime = jnp.argmax(_log(transition[regime]) + gumbel)
-        moments = Moments(state, jnp.zeros((size, size)))
-        predicted = _stack([predict(problem, interval, moments).moments
-                            for problem, interval in zip(regimes.problems, intervals, strict=True)])
-        state = predicted.mean[regime] + matvec(semidefinite_root(predicted.covariance[regime]), normal)
-        return (state, regime), (state, regime)
-
-    inputs = *jax.tree.map(lambda a: a[first:], (regimes.transitions, regimes.intervals)), normals, gumbels
-    states, indices = jax.lax.scan(step, (paths.state[-1, 0], paths.regime[-1, 0]), inputs)[1]
-    return jnp.concatenate([paths.state[:, 0], states]), jnp.concatenate([paths.regime[:, 0], indices])
+    end = jax.vmap(draw_last)(keys[last])
+    inputs = jax.tree.map(lambda a: a[:last], filtered), *jax.tree.map(
+        lambda a: a[1:last + 1], (regimes.transitions, regimes.intervals)), keys[:last]
+    earlier, probability = jax.lax.scan(step, end, inputs, reverse=True)[1]
+    later = jax.lax.scan(simulate, end[1], (regimes.transitions[last + 1:], keys[last + 1:]))[1]
+    return (jnp.concatenate([earlier, end[1][None], later]),
+            jnp.concatenate([probability, filtered.probability[last:]]))
 
 
-def _law_given_later(regimes: RegimeProblem, filtered: RegimeMoments, transition: jax.Array,
-                     intervals: tuple[Any, ...], later: RegimePaths) -> _ConditionalLaw:
-    """Return the law at the end of an interval given draws of state and regime at the end of the next."""
-    predictions = []
-    for problem, interval in zip(regimes.problems, intervals, strict=True):
-        predicted = jax.vmap(lambda source, problem=problem, interval=interval: predict(
-            problem, interval, source, record=Record.SMOOTHER))(filtered.moments)
-        kernel = jax.vmap(smoothing_kernel)(filtered.moments, predicted.moments, predicted.phi, predicted.process_cov)
-        predictions.append((predicted.moments, kernel))
-    predicted, kernel = _stack(predictions)
-    joint = (filtered.probability[:, None] * transition).T
-
-    def condition(state: jax.Array, regime: jax.Array) -> tuple[jax.Array, jax.Array]:
-        moments = jax.tree.map(lambda a: a[regime], predicted)
-        change = matvec(kernel.gain[regime], state - moments.mean)
-        return _source_probabilities(joint[regime], moments, state), filtered.moments.mean + change
-
-    weight, mean = jax.vmap(condition)(later.state, later.regime)
-    return _ConditionalLaw(weight, mean, kernel.conditional, later.regime)
+def sample_states(key: jax.Array, regimes: RegimeProblem, y: jax.Array, path: jax.Array) -> jax.Array:
+    """Draw the state (N, n) at the ends of the intervals given a path (N,) of regimes."""
+    trace = filter_path(regimes, y, path)
+    smoothed = backward(regimes.problems[0], trace).moments.mean[1:]
+    return smoothed + sample_errors(key, trace, 1)[:, :, 0]
 
 
 def _source_probabilities(weights: jax.Array, predicted: Moments, state: jax.Array) -> jax.Array:

@@ -128,13 +128,16 @@ def test_draws_have_the_smoothing_distribution():
     y = np.asarray(switching.sample(jax.random.key(1)))
     exact, regimes = enumerate_paths(switching, y), switching.regimes()
     trace = filter_regimes(regimes, jnp.asarray(y))
-    paths = jax.jit(lambda key: sample_regimes(key, regimes, trace, 4000))(jax.random.key(0))
+    paths, probability = jax.jit(lambda key: sample_regimes(key, regimes, trace, 4000))(jax.random.key(0))
     # Three standard errors of a probability are .024; merging adds less.
-    np.testing.assert_allclose((paths.regime == 1).mean(1), exact.probability[:, 1], atol=0.03)
-    np.testing.assert_allclose(paths.probability, exact.probability, atol=0.02)
-    np.testing.assert_allclose(paths.state.mean(1), exact.mean, atol=0.05)
+    np.testing.assert_allclose((paths == 1).mean(1), exact.probability[:, 1], atol=0.03)
+    np.testing.assert_allclose(probability, exact.probability, atol=0.02)
     smoothed = switching.smooth(y)
     np.testing.assert_allclose(smoothed.mean, exact.mean, atol=0.05)
+    w, _ = jax.jit(jax.vmap(lambda key: switching.sample_path(key, y)))(jax.random.split(jax.random.key(1), 4000))
+    states = np.asarray(w[:, :, [0, 3]])
+    np.testing.assert_allclose(states.mean(0), exact.mean, atol=0.05)
+    np.testing.assert_allclose(states.var(0), np.diagonal(smoothed.covariance, axis1=1, axis2=2), rtol=0.15)
 
 
 @pytest.mark.parametrize("merging", MERGINGS)
