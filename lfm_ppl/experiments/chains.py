@@ -26,7 +26,7 @@ have not converged only if they start at different points."""
 
 
 def nuts(model: Any, **settings: Any) -> NUTS:
-    """Return NUTS with a dense mass matrix and forward-mode gradients, which are cheaper for up to ten parameters."""
+    """Return NUTS with a dense mass matrix and forward-mode gradients, which are cheaper for a few parameters."""
     return NUTS(model, dense_mass=True, forward_mode_differentiation=True, **settings)
 
 

@@ -28,9 +28,12 @@ from lfm_ppl.inference.model_arguments import ModelArguments, signature
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.random_keys import split_keys
-from lfm_ppl.inference.series_likelihood import FORWARD_MODE_LIMIT, SeriesLikelihood
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.inference.traced_model import TracedModel
 from lfm_ppl.utils import checks
+
+_FORWARD_MODE_LIMIT = 4
+"""Largest number of unconstrained parameters for which forward-mode gradients are faster."""
 
 _ATTEMPTS = 20
 """Points that are drawn in the search for one of finite density."""
@@ -120,8 +123,7 @@ class BoundModel:
     @property
     def forward_mode(self) -> bool:
         """Whether gradients are taken in forward mode, which is faster for few parameters."""
-        return self.size <= min((site.example.forward_mode_limit for site in self.traced.likelihoods),
-                                default=FORWARD_MODE_LIMIT)
+        return self.size <= _FORWARD_MODE_LIMIT
 
     @property
     def site(self) -> LikelihoodSite:

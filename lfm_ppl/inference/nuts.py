@@ -25,7 +25,9 @@ from numpyro.infer.util import ParamInfo
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
 from lfm_ppl.inference.laplace_start import Laplace
-from lfm_ppl.inference.series_likelihood import FORWARD_MODE_LIMIT
+
+_DENSE_MASS_LIMIT = 10
+"""Largest number of unconstrained parameters with a dense mass matrix by default."""
 
 _PSEUDO_DRAWS = 20
 """Weight of the Laplace approximation in the covariance estimates of a warm-up, in draws."""
@@ -58,7 +60,7 @@ def nuts_options(bound: BoundModel, options: Mapping[str, Any], laplace: Laplace
     A dense mass matrix is the default for up to ten parameters, with a Laplace approximation for any number.
     """
     completed = {"forward_mode_differentiation": bound.forward_mode,
-                 "dense_mass": laplace is not None or bound.size <= FORWARD_MODE_LIMIT,
+                 "dense_mass": laplace is not None or bound.size <= _DENSE_MASS_LIMIT,
                  "target_accept_prob": _ACCEPTANCE if laplace is None else _ACCEPTANCE_AT_MODE, **options}
     if isinstance(completed["dense_mass"], bool):
         # Blocks of named sites, the form that NUTS itself uses for a model.

@@ -42,12 +42,6 @@ from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
 
-FORWARD_MODE_LIMIT = 10
-"""Number of parameters up to which a gradient in forward mode is faster than in reverse mode."""
-
-_MANY_STATES = 12
-"""Number of states of a linear time-invariant model above which its gradient is faster in reverse mode."""
-
 
 class SeriesLikelihood(dist.Distribution):
     """Distribution of the observations of one series, with state and forces integrated out.
@@ -129,11 +123,6 @@ class SeriesLikelihood(dist.Distribution):
     def is_family(self) -> bool:
         """Whether the observation is a family such as `lfm_ppl.PoissonObservation`, and not Gaussian."""
         return isinstance(self.model.observation, ObservationFamily)
-
-    @property
-    def forward_mode_limit(self) -> int:
-        """Number of parameters up to which gradients in forward mode are faster; none with many linear states."""
-        return 0 if self.ssm.mean_invariant and self.ssm.state_dim > _MANY_STATES else FORWARD_MODE_LIMIT
 
     @property
     def ssms(self) -> tuple[StateSpaceModel, ...]:

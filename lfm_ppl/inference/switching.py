@@ -5,9 +5,6 @@
 3. `smooth` gives probabilities of the regimes and moments of the state, as averages over draws of regimes.
 4. `sample_path` draws states and regimes given the data; `lfm_ppl.fit` stores such paths.
 5. `sample` simulates the real model by `switching.switched_simulation`, with the chain as its rule.
-
-Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8); Carter and Kohn
-(1994), Biometrika 81(3).
 """
 
 from __future__ import annotations
@@ -139,11 +136,6 @@ class Switching(SeriesLikelihood):
     def has_gaussian_state(self) -> bool:
         """Whether the state given data and parameters is Gaussian, so that one filter describes it."""
         return False
-
-    @property
-    def forward_mode_limit(self) -> int:
-        """One parameter: the filters of all pairs of regimes are slow with a tangent for each."""
-        return 1
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -33,7 +33,6 @@ def test_a_figure_has_one_panel_for_all_regimes_also_of_a_forecast_and_of_a_choi
                      truth={"times": data.times, "state": data.truth["state"]}, progress=False)
     lfm.save(result, tmp_path / "posterior.nc")
     result = lfm.load(tmp_path / "posterior.nc")
-    assert not lfm.bind(file.model, data.times, data.y).forward_mode
     states = result["trajectories"]["states"].sel(state=["cold", "warm"])
     np.testing.assert_allclose(states.sum("state"), 1.0)
     forecast = lfm.forecast(result, file.model, np.array([0.5, 1.0]), progress=False)
