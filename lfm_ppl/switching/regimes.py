@@ -216,7 +216,7 @@ def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace,
     keys = jax.random.split(key, (len(trace.log_likelihood), draws))
 
     def step(later: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
-        filtered, transition, intervals, keys = inputs
+        filtered, keys, transition, intervals = inputs
         predictions = []
         for problem, interval in zip(regimes.problems, intervals, strict=True):
             predict_source = functools.partial(predict, problem, interval, record=Record.SMOOTHER)
@@ -224,10 +224,10 @@ def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace,
             kernel = jax.vmap(smoothing_kernel)(filtered.moments, predicted.moments, predicted.phi,
                                                 predicted.process_cov)
             predictions.append((predicted.moments, kernel.gain, jax.vmap(semidefinite_root)(kernel.conditional)))
-        joint = (filtered.probability[:, None] * transition).T, _stack(predictions)
+        by_regime = (filtered.probability[:, None] * transition).T, _stack(predictions)
 
         def draw(key: jax.Array, state: jax.Array, regime: jax.Array) -> tuple[tuple, jax.Array]:
-            weights, (predicted, gain, root) = jax.tree.map(lambda a: a[regime], joint)
+            weights, (predicted, gain, root) = jax.tree.map(lambda a: a[regime], by_regime)
             probability = _source_probabilities(weights, predicted, state)
             source_key, state_key = jax.random.split(key)
             source = jax.random.categorical(source_key, _log(probability))
@@ -250,8 +250,8 @@ def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace,
         return regime, regime
 
     end = jax.vmap(draw_last)(keys[last])
-    inputs = jax.tree.map(lambda a: a[:last], filtered), *jax.tree.map(
-        lambda a: a[1:last + 1], (regimes.transitions, regimes.intervals)), keys[:last]
+    inputs = (*jax.tree.map(lambda a: a[:last], (filtered, keys)),
+              *jax.tree.map(lambda a: a[1:last + 1], (regimes.transitions, regimes.intervals)))
     earlier, probability = jax.lax.scan(step, end, inputs, reverse=True)[1]
     later = jax.lax.scan(simulate, end[1], (regimes.transitions[last + 1:], keys[last + 1:]))[1]
     return (jnp.concatenate([earlier, end[1][None], later]),
