@@ -33,7 +33,6 @@ from lfm_ppl.particles.stochastic_steps import choose_scheme
 from lfm_ppl.switching.chain import MarkovChain, check_probabilities, check_rates, transition_matrices
 from lfm_ppl.switching.regime_model import check_models, joint_model
 from lfm_ppl.switching.regimes import (
-    GPB2,
     MERGINGS,
     RegimeProblem,
     filter_regimes,
@@ -92,7 +91,8 @@ class Switching(SeriesLikelihood):
         steps: integration steps between two consecutive times; a linear time-invariant model is exact with any number.
         max_step: longest step, in units of time; longer intervals get more steps.
         initial: (K,), probabilities of the regimes at the first observation; None: equal ones.
-        merging: "gpb2", K^2 filters a row, or "imm", K filters, which is faster and merges earlier.
+        merging: "gpb2", K^2 filters a row; "gpb3" and "gpb4", K^3 and K^4 filters, for regimes whose states stay
+            apart; or "imm", K filters, which is faster and merges earlier.
 
     Raises:
         ValueError, TypeError: models of other states or outputs; rates or probabilities that are none; and as
@@ -114,7 +114,7 @@ class Switching(SeriesLikelihood):
         (('calm', 'rough'), (5, 2))
 
     Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8), for IMM; Tugnait (1982),
-    Automatica 18(5), for GPB2; Carter and Kohn (1994), Biometrika 81(3), for the draws.
+    Automatica 18(5), for GPBn; Carter and Kohn (1994), Biometrika 81(3), for the draws.
     """
 
     pytree_data_fields = ("models", "rates", "initial")
@@ -122,7 +122,7 @@ class Switching(SeriesLikelihood):
 
     def __init__(self, models: Mapping[str, LatentForceModel], rates: ArrayLike, times: ArrayLike,
                  rule: Rule | None = None, steps: int = 10, max_step: float | None = None, *,
-                 initial: ArrayLike | None = None, merging: str = GPB2) -> None:
+                 initial: ArrayLike | None = None, merging: str = "gpb2") -> None:
         checks.one_of("merging", merging, MERGINGS)
         by_name = check_models(models)
         count = len(by_name)
@@ -165,7 +165,8 @@ class Switching(SeriesLikelihood):
         """Return the filter problems of the regimes and the chain on a time grid; None: that of the data."""
         grid = self.time_grid if grid is None else grid
         problems = tuple(filter_problem(ssm, self.rule, grid) for ssm in self.ssms)
-        return RegimeProblem(problems, self.initial, *regime_transitions(self.rates, grid), self.merging)
+        return RegimeProblem(problems, self.initial, *regime_transitions(self.rates, grid),
+                             MERGINGS.index(self.merging))
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log density of ``value`` (T, D), NaN where missing; batch dimensions may lead."""

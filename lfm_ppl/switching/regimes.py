@@ -5,7 +5,8 @@ The state s is Gaussian in each regime r, with p(r_k = j | y_1:k) beside it. For
 1. Where a new regime may begin, after an observation, the states of each regime are merged by their moments, and the
    chain moves: c_ij = p(r_k-1 = i | y_1:k-1) P_ij.
 2. GPB2 takes the state of each regime i on under each regime j, K^2 filters. IMM merges the states that enter regime j
-   by their moments, too, with the weights c_ij / sum_i c_ij, and takes K filters.
+   by their moments, too, with the weights c_ij / sum_i c_ij, and takes K filters. GPBn keeps a state for each history
+   of the last n - 1 regimes, and takes K^n filters.
 3. The one-step-ahead density is the mixture sum_ij c_ij N(y_k; mu_ij, S_ij), whose terms are the new weights.
 
 From the last interval to the first, for each of S draws of the later state s_k+1 and its regime j,
@@ -17,7 +18,7 @@ From the last interval to the first, for each of S draws of the later state s_k+
    draws of the state are exact.
 
 Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8), for IMM; Tugnait (1982), Automatica
-18(5), for GPB2; Carter and Kohn (1994), Biometrika 81(3), for the draws.
+18(5), for GPBn; Carter and Kohn (1994), Biometrika 81(3), for the draws.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ from lfm_ppl.utils import checks
 from lfm_ppl.utils.gaussian_residuals import log_density
 from lfm_ppl.utils.linalg import cholesky, diagonal, semidefinite_root, solve_lower
 
-IMM, GPB2 = MERGINGS = "imm", "gpb2"
-"""Methods of merging."""
+MERGINGS = ("imm", "gpb2", "gpb3", "gpb4")
+"""Methods of merging, by the number of latest regimes for each of whose histories a state is kept."""
 
 _JITTER = 1e-10
 """Relative variance added to a predicted covariance whose density is compared between regimes: it may be singular."""
@@ -59,14 +60,14 @@ class RegimeProblem(NamedTuple):
         initial: (K,), probabilities of the regimes at the first observation.
         transitions: (N, K, K), probabilities p(r_k = j | r_k-1 = i) at the starts of the intervals.
         is_start: (N,), whether an interval is the first after an observation, so that the regime may change.
-        merging: one of `MERGINGS`.
+        memory: number of latest regimes whose histories have states of their own; 0: merged before the prediction, too.
     """
 
     problems: tuple[FilterProblem, ...]
     initial: jax.Array
     transitions: jax.Array
     is_start: jax.Array
-    merging: str
+    memory: int
 
     @property
     def grid(self) -> TimeGrid:
@@ -80,7 +81,7 @@ class RegimeProblem(NamedTuple):
 
 
 class RegimeMoments(NamedTuple):
-    """Probabilities (..., K) of the regimes and moments (..., K, n), (..., K, n, n) of the state in each."""
+    """Probabilities (..., K, M) of the K regimes and M histories before each, and moments of the state given them."""
 
     probability: jax.Array
     moments: Moments
@@ -143,7 +144,7 @@ def filter_path(regimes: RegimeProblem, y: jax.Array, path: jax.Array) -> Filter
     """Run the filter given a path (N,) of regimes, as that of a chain that takes this path with certainty."""
     indicators = jax.nn.one_hot(path, len(regimes.problems))
     transitions = jnp.broadcast_to(indicators[:, None], regimes.transitions.shape)
-    certain = regimes._replace(initial=indicators[0], transitions=transitions, merging=IMM)
+    certain = regimes._replace(initial=indicators[0], transitions=transitions, memory=0)
     trace = _forward(certain, y, Record.SMOOTHER)[1]
     initial = _stack([problem.initial() for problem in regimes.problems])
     return jax.vmap(lambda trace, regime: jax.tree.map(lambda a: a[regime, 0], trace))(trace, path)._replace(
@@ -158,14 +159,19 @@ def smooth_path(regimes: RegimeProblem, y: jax.Array, path: jax.Array) -> Smooth
 def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[RegimeTrace, FilterTrace | None]:
     """Run the forward scan; of a `Record.SMOOTHER` return the traces (N, K, S, ...) of regimes and sources, too."""
     updater = GaussianUpdate(y)
-    initial = RegimeMoments(regimes.initial, _stack([problem.initial() for problem in regimes.problems]))
+    count = len(regimes.problems)
+    histories = count**max(regimes.memory - 1, 0)
+    initial = RegimeMoments(
+        jnp.broadcast_to(regimes.initial[:, None] / histories, (count, histories)),
+        jax.tree.map(lambda a: jnp.repeat(a[:, None], histories, axis=1),
+                     _stack([problem.initial() for problem in regimes.problems])))
     updates = [updater.bind(problem, problem.initial()) for problem in regimes.problems]
     rows = with_observations(regimes.grid.intervals, updater.rows())[1]
 
     def step(carry: tuple[RegimeMoments, RegimeMoments], inputs: tuple) -> tuple[tuple, tuple]:
         sources, merged = carry
         transition, is_start, intervals, row = inputs
-        entering = _enter_regimes(merged, transition, regimes.merging)
+        entering = _enter_regimes(merged, transition, regimes.memory)
         sources = jax.tree.map(lambda a, b: jnp.where(is_start, a, b), entering, sources)
         traces, distributions = [], []
         for j, (problem, update, interval) in enumerate(zip(regimes.problems, updates, intervals, strict=True)):
@@ -184,24 +190,26 @@ def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[Regi
         log_weight = _log(sources.probability) + trace.log_likelihood
         total = logsumexp(log_weight)
         weight = jnp.exp(log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
-        filtered = RegimeMoments(weight.sum(1), jax.vmap(merge)(weight, trace.filtered))
+        # The oldest regime of a history comes last.
+        joint, sources = jax.tree.map(lambda a: a.reshape(count, histories, -1, *a.shape[2:]), (weight, trace.filtered))
+        filtered = RegimeMoments(joint.sum(2), jax.vmap(jax.vmap(merge))(joint, sources))
         residual = ndtri(jnp.clip(sum(distributions), 1e-15, 1 - 1e-15))
         output = RegimeTrace(total, filtered, jnp.where(jnp.isfinite(row), residual, jnp.nan))
         recorded = None if record is Record.LIKELIHOOD else trace
         return (RegimeMoments(weight, trace.filtered), filtered), (output, recorded)
 
-    carry = _enter_regimes(initial, regimes.transitions[0], regimes.merging), initial
+    carry = _enter_regimes(initial, regimes.transitions[0], regimes.memory), initial
     inputs = regimes.transitions, regimes.is_start, regimes.intervals, rows
     return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, inputs)[1]
 
 
-def _enter_regimes(filtered: RegimeMoments, transition: jax.Array, merging: str) -> RegimeMoments:
+def _enter_regimes(filtered: RegimeMoments, transition: jax.Array, memory: int) -> RegimeMoments:
     """Return joint probabilities (K, S) of regimes and their sources after a transition, and the sources' moments."""
-    joint = (filtered.probability[:, None] * transition).T
-    if merging == GPB2:
-        sources = jax.tree.map(lambda a: jnp.broadcast_to(a, (*joint.shape, *a.shape[1:])), filtered.moments)
-        return RegimeMoments(joint, sources)
-    merged = jax.vmap(merge, (0, None))(joint, filtered.moments)
+    joint = (transition.T[:, :, None] * filtered.probability).reshape(transition.shape[0], -1)
+    sources = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), filtered.moments)
+    if memory:
+        return RegimeMoments(joint, jax.tree.map(lambda a: jnp.broadcast_to(a, (len(joint), *a.shape)), sources))
+    merged = jax.vmap(merge, (0, None))(joint, sources)
     return RegimeMoments(joint.sum(1, keepdims=True), jax.tree.map(lambda a: a[:, None], merged))
 
 
@@ -213,36 +221,38 @@ def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace,
         The paths (N, S) and the probabilities (N, K) of the regimes, at the ends of the intervals.
     """
     filtered, last = trace.filtered, max(regimes.grid.observed)
+    histories = filtered.probability.shape[2]
     keys = jax.random.split(key, (len(trace.log_likelihood), draws))
 
     def step(later: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
         filtered, keys, transition, intervals = inputs
+        joint, sources = _enter_regimes(filtered, transition, 1)
+        sources = jax.tree.map(lambda a: a[0], sources)  # they are the same for all regimes
         predictions = []
         for problem, interval in zip(regimes.problems, intervals, strict=True):
-            predict_source = functools.partial(predict, problem, interval, record=Record.SMOOTHER)
-            predicted = jax.vmap(predict_source)(filtered.moments)
-            kernel = jax.vmap(smoothing_kernel)(filtered.moments, predicted.moments, predicted.phi,
-                                                predicted.process_cov)
+            predicted = jax.vmap(functools.partial(predict, problem, interval, record=Record.SMOOTHER))(sources)
+            kernel = jax.vmap(smoothing_kernel)(sources, predicted.moments, predicted.phi, predicted.process_cov)
             predictions.append((predicted.moments, kernel.gain, jax.vmap(semidefinite_root)(kernel.conditional)))
-        by_regime = (filtered.probability[:, None] * transition).T, _stack(predictions)
+        by_regime = joint, _stack(predictions)
 
         def draw(key: jax.Array, state: jax.Array, regime: jax.Array) -> tuple[tuple, jax.Array]:
             weights, (predicted, gain, root) = jax.tree.map(lambda a: a[regime], by_regime)
             probability = _source_probabilities(weights, predicted, state)
             source_key, state_key = jax.random.split(key)
             source = jax.random.categorical(source_key, _log(probability))
-            mean = filtered.moments.mean[source] + gain[source] @ (state - predicted.mean[source])
-            return (mean + root[source] @ jax.random.normal(state_key, mean.shape), source), probability
+            mean = sources.mean[source] + gain[source] @ (state - predicted.mean[source])
+            state = mean + root[source] @ jax.random.normal(state_key, mean.shape)
+            return (state, source // histories), probability.reshape(-1, histories).sum(1)
 
         earlier, probability = jax.vmap(draw)(keys, *later)
         return earlier, (earlier[1], probability.mean(0))
 
     def draw_last(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        regime_key, state_key = jax.random.split(key)
-        regime = jax.random.categorical(regime_key, _log(filtered.probability[last]))
-        root = semidefinite_root(filtered.moments.covariance[last, regime])
-        mean = filtered.moments.mean[last, regime]
-        return mean + root @ jax.random.normal(state_key, mean.shape), regime
+        source_key, state_key = jax.random.split(key)
+        probability, moments = jax.tree.map(lambda a: a[last].reshape(-1, *a.shape[3:]), filtered)
+        source = jax.random.categorical(source_key, _log(probability))
+        normal = jax.random.normal(state_key, moments.mean[source].shape)
+        return moments.mean[source] + semidefinite_root(moments.covariance[source]) @ normal, source // histories
 
     def simulate(regime: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         transition, keys = inputs
@@ -255,7 +265,7 @@ def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace,
     earlier, probability = jax.lax.scan(step, end, inputs, reverse=True)[1]
     later = jax.lax.scan(simulate, end[1], (regimes.transitions[last + 1:], keys[last + 1:]))[1]
     return (jnp.concatenate([earlier, end[1][None], later]),
-            jnp.concatenate([probability, filtered.probability[last:]]))
+            jnp.concatenate([probability, filtered.probability[last:].sum(2)]))
 
 
 def sample_states(key: jax.Array, regimes: RegimeProblem, y: jax.Array, path: jax.Array) -> jax.Array:

@@ -18,7 +18,7 @@ from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.switching.chain import MarkovChain, transition_matrices
 from lfm_ppl.switching.regimes import filter_regimes, sample_regimes
 
-MERGINGS = ("gpb2", "imm")
+MERGINGS = ("gpb2", "gpb3", "imm")
 RATES = np.array([[0.0, 0.3], [0.5, 0.0]])
 
 
@@ -117,9 +117,13 @@ def test_the_density_equals_enumeration_where_merging_is_exact(case, merging):
     np.testing.assert_allclose(smoothed.probability, exact.probability, atol=0.07)
 
 
-def test_gpb2_equals_enumeration_for_two_observations():
-    switching = lfm.Switching({"calm": build(0.3), "rough": build(2.0, 0.3)}, RATES, np.array([0.0, 1.0]))
-    y = np.array([[0.3], [1.5]])
+@pytest.mark.parametrize(("merging", "rows"), [("gpb2", 2), ("gpb3", 3), ("gpb4", 4)])
+def test_short_records_equal_enumeration(merging, rows):
+    """No two histories are merged before the last row."""
+    models = {"calm": build(0.3), "rough": build(2.0, 0.3), "far": build(level=2.0)}
+    rates = np.array([[0.0, 0.3, 0.1], [0.5, 0.0, 0.2], [0.4, 0.1, 0.0]])
+    switching = lfm.Switching(models, rates, np.cumsum(np.arange(rows) / 2), merging=merging)
+    y = np.array([[0.3], [1.5], [-0.8], [2.0]])[:rows]
     np.testing.assert_allclose(switching.log_prob(y), enumerate_paths(switching, y).total, rtol=1e-10)
 
 
@@ -182,20 +186,22 @@ def rao_blackwellised(switching, y, particles, key=0):
 
 PARTICLE_CASES = {"force": lambda: {"calm": build(0.5), "rough": build(2.0)},
                   "noise": lambda: {"sharp": build(noise=0.05), "vague": build(noise=1.0)},
-                  "level": lambda: {"low": build(0.5), "high": build(0.5, level=4.0)}}
+                  "level": lambda: {"low": build(0.5), "high": build(0.5, level=4.0)},
+                  "decay": lambda: {"slow": build(0.5, decay=0.2, level=4.0), "fast": build(0.5, decay=2.0)}}
 
 
 @pytest.mark.parametrize("case", PARTICLE_CASES)
 def test_the_density_is_that_of_particles(case):
-    switching = lfm.Switching(PARTICLE_CASES[case](), 0.3 * RATES, np.arange(40.0))
+    switching = lfm.Switching(PARTICLE_CASES[case](), 0.3 * RATES, np.arange(40.0), merging="gpb4")
     y = np.asarray(switching.sample(jax.random.key(2)))
     assert abs(rao_blackwellised(switching, y, 10_000) - float(switching.log_prob(y))) < 0.1
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("merging", ["gpb2", "gpb4"])
 @pytest.mark.parametrize("case", PARTICLE_CASES)
-def test_long_series_are_within_a_tenth_of_many_particles(case):
-    switching = lfm.Switching(PARTICLE_CASES[case](), 0.3 * RATES, np.arange(200.0))
+def test_long_series_are_within_a_tenth_of_many_particles(case, merging):
+    switching = lfm.Switching(PARTICLE_CASES[case](), 0.3 * RATES, np.arange(200.0), merging=merging)
     y = np.asarray(switching.sample(jax.random.key(2)))
     assert abs(rao_blackwellised(switching, y, 100_000) - float(switching.log_prob(y))) < 0.1
 
