@@ -157,7 +157,7 @@ def refine(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, in
         return RefinedSites(fixed_point, points, maps, jnp.asarray(-jnp.inf))
     fallback = stop_gradient_of_call(lambda fixed_point, sites: jax.tree.map(
         functools.partial(jnp.where, fixed_point.converged), fixed_point.sites, sites), fixed_point,
-        clip_to_proper(_sites_of(problem, trace)))
+        clip_to_proper(at_intervals(trace.update.site_terms.sites, problem.grid.observed)))
     return RefinedSites(fixed_point._replace(sites=fallback), points, maps, trace.log_likelihood.sum())
 
 
@@ -170,7 +170,7 @@ def _sites_from_prior(problem: FilterProblem, terms: FamilyTerms, initial: Momen
     """
     empty = jnp.zeros_like(terms.y)
     trace = forward(problem, SiteUpdate(Sites(empty, empty, empty)), initial=initial, record=Record.MOMENTS, maps=maps)
-    prior = jax.tree.map(lambda a: at_intervals(a, problem.grid.observed), trace.update.site_terms)
+    prior = at_intervals(trace.update.site_terms, problem.grid.observed)
     mean, variance = prior.value, diagonal(prior.variance)
     cavity = with_positive_variance(mean, variance)
     tilted = terms.tilted(cavity, tilted_mode(terms.log_prob, cavity), 1.0, is_coarse=True)
@@ -187,14 +187,7 @@ def _smooth_with_sites(problem: FilterProblem, updater: Updater, initial: Moment
     """Return a forward and an adjoint scan, and the smoothed predictor (T, ...)."""
     trace = forward(problem, updater, initial=initial, about=points, record=record, maps=maps)
     smoothed = backward(problem, trace, adjoint_only=True)
-    predictor = jax.tree.map(lambda a: at_intervals(a, problem.grid.observed), smoothed.predictor)
-    assert predictor is not None
-    return trace, smoothed, predictor
-
-
-def _sites_of(problem: FilterProblem, trace: FilterTrace) -> Sites:
-    """Return the sites (T, D) of a forward scan."""
-    return jax.tree.map(lambda a: at_intervals(a, problem.grid.observed), trace.update.site_terms.sites)
+    return trace, smoothed, at_intervals(smoothed.predictor, problem.grid.observed)
 
 
 def _joint_sweeps(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, initial: Moments,
@@ -209,7 +202,7 @@ def _joint_sweeps(problem: FilterProblem, terms: EntryTerms, settings: SiteSetti
         maps = maps_about(problem, points) if points is not None and needs_ends_only else None
         record = Record.LINEARIZATION if maps is None else Record.SMOOTHER
         trace, smoothed, predictor = _smooth_with_sites(problem, updater, initial, points, record, maps)
-        sites = _sites_of(problem, trace)
+        sites = at_intervals(trace.update.site_terms.sites, grid.observed)
         cavity = cavities(predictor, sites, terms.present, settings.power)
         # Points of linearisation take the derivative of these sites, and that of coarse ones is not exact enough.
         refined = new_sites(terms, sites, cavity, settings, settings.damping)[0]

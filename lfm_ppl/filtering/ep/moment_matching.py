@@ -194,7 +194,7 @@ def assumed_density_filter(problem: FilterProblem, y: jax.Array, initial: Moment
     """Filter data of a family: the site of each observation is made from its prediction, once."""
     updater = MomentMatchingUpdate(observation_family(problem), y)
     trace = forward(problem, updater, initial=initial, record=Record.MOMENTS)
-    at_data = jax.tree.map(lambda a: at_intervals(a, problem.grid.observed), trace._replace(initial=None))
+    at_data = at_intervals(trace._replace(initial=None), problem.grid.observed)
     terms = at_data.update.site_terms
     return PrequentialResult(at_data.log_likelihood, trace,
                              with_positive_variance(terms.value, diagonal(terms.variance)))
