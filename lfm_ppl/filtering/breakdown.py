@@ -19,13 +19,14 @@ from lfm_ppl.filtering.ep.evidence import refine
 from lfm_ppl.filtering.ep.fixed_point import FixedPoint
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
 from lfm_ppl.filtering.ep.settings import SiteSettings
-from lfm_ppl.filtering.ep.terms import FamilyTerms, row_log_prob
+from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA, Intervals, TimeGrid, intervals_between
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem, has_exact_transitions
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.observation_noise import row_log_prob
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils import checks

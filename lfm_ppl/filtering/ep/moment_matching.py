@@ -26,7 +26,6 @@ from jax.scipy.special import ndtri
 
 from lfm_ppl.filtering.ep.cavities import is_deterministic, with_positive_variance
 from lfm_ppl.filtering.ep.quadrature import MeanVariance, TiltedMoments, expectation, tilted_moments
-from lfm_ppl.filtering.ep.terms import row_log_prob
 from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals
@@ -38,6 +37,7 @@ from lfm_ppl.filtering.update import (
     multiply_by_sites,
     predictor_variance,
 )
+from lfm_ppl.model.observation_noise import row_log_prob
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.utils.linalg import diagonal
 
