@@ -59,7 +59,7 @@ class ParticleLikelihood(dist.Distribution):
         value = jnp.asarray(checks.unmask(value), float)
         if isinstance(self.base, Panel):
             keys = jax.random.split(self.key, self.base.batch_shape[0])
-            return self.base.mapped(lambda series, y, key: self._series_log_prob(series, y, key), value, keys)
+            return self.base.mapped(self._series_log_prob, value, keys)
         return self._series_log_prob(self.base, value, self.key)
 
     def _series_log_prob(self, base: SeriesLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:

@@ -12,7 +12,6 @@ import numpy as np
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.map_draws import SharedFunction, map_draws, map_series
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 
 POINTS = 100
 """Points at which the likelihood is evaluated."""
@@ -81,11 +80,8 @@ def failures_at(bound: BoundModel, values: Mapping[str, Any], limit: int = POINT
     if not bound.site.example.has_sites:
         return None
 
-    def evaluate(distribution: SeriesLikelihood, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return distribution.convergence(y)
-
     def per_draw(values: Any, key: jax.Array, y: Any) -> tuple[jax.Array, jax.Array]:
-        return map_series(bound.likelihood(values, y), evaluate, bound.data(y))
+        return map_series(bound.likelihood(values, y), lambda series, y: series.convergence(y), bound.data(y))
 
     def in_all_series(flags: Any) -> np.ndarray:
         return np.all(np.asarray(flags).reshape(len(flags), -1), axis=1)

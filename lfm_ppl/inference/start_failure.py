@@ -41,17 +41,13 @@ def _site_failure(bound: BoundModel) -> str | None:
         if site["type"] != "sample" or name in likelihoods:
             continue
         if not site["is_observed"] and not np.isfinite(np.asarray(site["value"], float)).all():
-            return (f"the value of {name!r} is not finite ({_format_array(site['value'])}): check the parameters of "
-                    "its prior.")
+            value = np.array2string(np.asarray(site["value"], float), threshold=5, separator=", ").replace("\n", "")
+            return f"the value of {name!r} is not finite ({value}): check the parameters of its prior."
         total = float(jnp.sum(site["fn"].log_prob(site["value"])))
         if not np.isfinite(total):
             kind = "site" if site["is_observed"] else "prior of"
             return f"the {kind} {name!r} has the log density {total:g}."
     return None
-
-
-def _format_array(value: Any) -> str:
-    return np.array2string(np.asarray(value, float), threshold=5, separator=", ").replace("\n", "")
 
 
 def _likelihood_failure(bound: BoundModel, z: Any) -> str | None:
