@@ -22,7 +22,7 @@ from numpyro.util import identity, is_prng_key
 
 from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
 from lfm_ppl.inference.kernels.kernel import Kernel, as_floating_point, check_start, map_chains
-from lfm_ppl.inference.kernels.robust_metropolis import RAMState, finite_or_infinity, robust_metropolis
+from lfm_ppl.inference.kernels.robust_metropolis import Adaptation, RAMState, finite_or_infinity, robust_metropolis
 from lfm_ppl.inference.unconstrained import check_latent_sites
 from lfm_ppl.utils import checks
 
@@ -113,19 +113,12 @@ class RAM(Kernel):
             checks.positive("initial_scale", initial_scale)
         super().__init__(model)
         self._potential_fn = potential_fn
-        self._target_accept_prob = target_accept_prob
+        self.adaptation = Adaptation(target_accept_prob, exponent, adapt == "throughout")
         self._initial_scale = initial_scale
         self._initial_chol = None if initial_covariance is None else _cholesky(initial_covariance)
-        self._adapt_throughout = adapt == "throughout"
-        self._exponent = exponent
         self._init_strategy = init_strategy
         self._potential_fn_gen: Callable | None = None
         self._postprocess_fn: Callable | None = None
-
-    @property
-    def adaptation(self) -> tuple[float | None, float, bool]:
-        """Target acceptance probability, exponent, and whether the adaptation continues after the warm-up."""
-        return self._target_accept_prob, self._exponent, self._adapt_throughout
 
     def get_diagnostics_str(self, state: RAMState) -> str:
         """Return the step size and the mean acceptance probability, for the progress bar."""
