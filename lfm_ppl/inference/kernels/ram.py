@@ -16,14 +16,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
-from numpyro.infer import init_to_median
+from numpyro import handlers
+from numpyro.infer import init_to_median, init_to_uniform
 from numpyro.infer.util import ParamInfo, initialize_model
 from numpyro.util import identity, is_prng_key
 
 from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
 from lfm_ppl.inference.kernels.kernel import Kernel, as_floating_point, check_start, map_chains
 from lfm_ppl.inference.kernels.robust_metropolis import Adaptation, RAMState, finite_or_infinity, robust_metropolis
-from lfm_ppl.inference.unconstrained import check_latent_sites
+from lfm_ppl.inference.unconstrained import check_latent, latent_sites
 from lfm_ppl.utils import checks
 
 _ADAPTATIONS = ("warmup", "throughout")
@@ -154,7 +155,9 @@ class RAM(Kernel):
                            kwargs: dict) -> tuple[Any, jax.Array]:
         if self._model is not None:
             first_key = key if is_prng_key(key) else key[0]
-            check_latent_sites(self._model, args, kwargs, first_key, "RAM")
+            # init_to_uniform also serves improper priors, from which nothing can be drawn.
+            seeded = handlers.substitute(handlers.seed(self._model, first_key), substitute_fn=init_to_uniform)
+            check_latent(latent_sites(handlers.trace(seeded).get_trace(*args, **kwargs)), "RAM")
             info, self._potential_fn_gen, self._postprocess_fn, _ = initialize_model(
                 key,
                 self._model,
