@@ -252,16 +252,9 @@ def _interval_integrator(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.
 
 def _simulation_step(ssm: StateSpaceModel, state: jax.Array, span: Span, h: jax.Array, transition: jax.Array,
                      root: jax.Array, key: jax.Array) -> jax.Array:
-    """Return the joint state (n,) after one integration step of length h.
+    """Return the joint state (n,) after one integration step of length h from the start of ``span``.
 
-    Args:
-        ssm: the state-space model.
-        state: (n,), the joint state at the start of the step.
-        span: the remaining span of the interval, which starts at the start of the step.
-        h: step length.
-        transition: of the forces over the step.
-        root: square root of the process noise of the forces over the step.
-        key: random key of the step.
+    ``transition`` is that of the forces over the step, ``root`` a square root of their process noise.
     """
     size = ssm.physical_dim
     force_key, state_key = jax.random.split(key)

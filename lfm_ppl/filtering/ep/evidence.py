@@ -255,11 +255,7 @@ def _final_sites(terms: FamilyTerms, fixed_point: FixedPoint, uses_moments: bool
 
     Over a small variance v a factor hardly differs from a constant, and moments of the tilted distribution have its
     slope to eps / sd only. The derivatives of log p at the mean are the slope and the curvature to a relative error v.
-
-    Args:
-        terms: the factors of the data.
-        fixed_point: result of the sweeps.
-        uses_moments: whether the sites come from moments, as in expectation propagation.
+    ``uses_moments``: whether the sites come from moments, as in expectation propagation.
     """
     sites, cavity = fixed_point.sites, fixed_point.cavity
     nu, tau = sites.nu, sites.tau
