@@ -90,19 +90,18 @@ class Evidence(NamedTuple):
     refined: RefinedSites
 
 
-def evidence(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, *, initial: Moments | None = None,
-             first: Sites | None = None, record: Record = Record.LIKELIHOOD) -> Evidence:
+def evidence(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, *, first: Sites | None = None,
+             record: Record = Record.LIKELIHOOD) -> Evidence:
     """Return the log evidence of a model with sites, with a derivative.
 
     Args:
         problem: the model, the rule and the time grid.
         terms: factors that the sites approximate.
         settings: how the sites are refined.
-        initial: moments at the initial time; None: the model's.
         first: first sites; None: see step 1 above, for an observation family.
         record: recorded output of the last forward scan.
     """
-    initial = problem.initial(initial)
+    initial = problem.initial()
     refined = refine(problem, terms, settings, initial, first)
     fixed_point = refined.fixed_point
     cavity = fixed_point.cavity
@@ -129,7 +128,7 @@ def evidence(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, 
 
 def refine(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, initial: Moments,
            first: Sites | None = None) -> RefinedSites:
-    """Refine sites until they do not change; arguments as in `evidence`.
+    """Refine sites until they do not change; ``initial`` are moments, other arguments as in `evidence`.
 
     Where the sites of a non-linear model do not converge, the result has the sites of assumed density filtering,
     without negative precisions: with them a variance could be negative about other points.
@@ -231,8 +230,8 @@ def _sweep_until_converged(problem: FilterProblem, terms: EntryTerms, settings: 
         return Sweep(new, cavity, log_partition, jnp.where(is_valid(predictor, cavity), change, jnp.inf))
 
     # Points of linearisation come from sweeps of the same sites, whose changes do not grow any more.
-    growing_sweeps = FixedPointOptions().growing_sweeps if points is None else 1
-    return iterate_sites(sweep, first, settings.damping, settings.sweeps, growing_sweeps)
+    options = FixedPointOptions() if points is None else FixedPointOptions(growing_sweeps=1)
+    return iterate_sites(sweep, first, settings.damping, settings.sweeps, options)
 
 
 def _newton_step(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, initial: Moments,
