@@ -19,13 +19,14 @@ from lfm_ppl.filtering.ep.evidence import refine
 from lfm_ppl.filtering.ep.fixed_point import FixedPoint
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
 from lfm_ppl.filtering.ep.settings import SiteSettings
-from lfm_ppl.filtering.ep.terms import FamilyTerms, row_log_prob
+from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA, Intervals, TimeGrid, intervals_between
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem, has_exact_transitions
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.model.observation_noise import row_log_prob
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils import checks
@@ -61,16 +62,19 @@ def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, 
     if is_finite and np.all(converged):
         return
     if isinstance(ssm.model.observation, ObservationFamily):
-        checks.warn(_explain_sites(ssm, rule, grid, y, start, sites, is_finite), FilterWarning)
+        checks.warn(family_breakdown(ssm, rule, grid, y, sites, start, is_finite), FilterWarning)
         return
     checks.warn(breakdown(ssm, rule, grid, y, start) or "the log likelihood is -inf, but the filter does not break "
                 "down without posterior linearisation: try iterations=0, or a smaller damping, such as damping=0.5.",
                 FilterWarning)
 
 
-def _explain_sites(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None,
-                  settings: SiteSettings | None, is_finite: bool) -> str:
-    """Return a message on sites that do not converge, or on a log likelihood of a family that is not finite."""
+def family_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, settings: SiteSettings | None,
+                     start: Moments | None = None, is_finite: bool = False) -> str:
+    """Return why the log likelihood of an observation family is not finite, or its sites do not converge.
+
+    Arguments must be concrete.
+    """
     remedy = ("Try a smaller share of each new site, sites=lfm.SiteSettings(damping=0.5), half powers, "
               "sites=lfm.SiteSettings(power=0.5), or a tighter prior")
     y = jnp.asarray(y, float)
@@ -93,11 +97,6 @@ def _explain_sites(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, sta
     return (f"the sites of the observation family do not converge in {int(fixed_point.sweeps)} sweeps (the last "
             f"changes a site by {float(fixed_point.change):.2g}){where}. The log likelihood is "
             f"{'that of assumed density filtering, which is rougher' if is_finite else '-inf'}. {remedy}.")
-
-
-def family_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, settings: SiteSettings) -> str:
-    """Return why the log likelihood of an observation family is not finite. Arguments must be concrete."""
-    return _explain_sites(ssm, rule, grid, y, None, settings, is_finite=False)
 
 
 def _explain_row(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments) -> str | None:

@@ -4,8 +4,6 @@
 2. One forward scan predicts and updates (`lfm_ppl.filtering.forward`); an observation family is filtered by assumed
    density filtering.
 3. The last moments are a `FilterState`, from which a later call continues.
-
-Source: Särkkä and Sarmavuori (2013), Signal Processing 93.
 """
 
 from __future__ import annotations
@@ -151,18 +149,17 @@ def filter_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, ti
               initial: Moments | None = None) -> FilterResult:
     """Filter observations (T, D) at ``times`` on the intervals of a time grid; see `filter`."""
     problem = filter_problem(ssm, rule, grid)
-    log_likelihood = residual = None
-    if isinstance(ssm.model.observation, ObservationFamily):
-        log_likelihood, trace, prediction = assumed_density_filter(problem, y, initial)
-        residual = quantile_residuals(ssm.model.observation, prediction, y)
+    family = ssm.model.observation
+    if isinstance(family, ObservationFamily):
+        _, trace, prediction = assumed_density_filter(problem, y, initial)
     else:
         trace = forward(problem, GaussianUpdate(y), initial=initial, record=Record.MOMENTS)
-    at_data = jax.tree.map(lambda a: at_intervals(a, grid.observed), trace._replace(initial=None))
+    at_data = at_intervals(trace._replace(initial=None), grid.observed)
+    residual = (quantile_residuals(family, prediction, y) if isinstance(family, ObservationFamily)
+                else whitened_innovations(at_data, y))
     state = FilterState(times[-1], at_data.filtered.mean[-1], at_data.filtered.covariance[-1])
-    return FilterResult(times, at_data.log_likelihood if log_likelihood is None else log_likelihood,
-                        at_data.predicted.mean, at_data.predicted.covariance, at_data.filtered.mean,
-                        at_data.filtered.covariance, whitened_innovations(at_data, y) if residual is None else residual,
-                        state)
+    return FilterResult(times, at_data.log_likelihood, at_data.predicted.mean, at_data.predicted.covariance,
+                        at_data.filtered.mean, at_data.filtered.covariance, residual, state)
 
 
 def whitened_innovations(at_data: FilterTrace, y: jax.Array) -> jax.Array:

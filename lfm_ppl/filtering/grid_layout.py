@@ -36,8 +36,8 @@ class GridLayout(NamedTuple):
     Attributes:
         grid: the time grid without breakpoints and events at a traced lag.
         rows: for each read of a known input, the rows of its table that are breakpoints.
-        is_lagged: for each read, whether its breakpoints are at a traced lag.
-        is_event_lagged: for each event, whether its time is at a traced lag, so that it is not in the grid.
+        is_lagged: for each read, whether its breakpoints are at a traced lag, or all times are traced.
+        is_event_lagged: for each event, whether its time is traced, so that it is not in the grid.
     """
 
     grid: TimeGrid

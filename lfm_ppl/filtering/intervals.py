@@ -107,38 +107,25 @@ def with_state_maps(ssm: StateSpaceModel, grid: TimeGrid) -> TimeGrid:
     return grid._replace(intervals=grid.intervals._replace(state_map=jax.tree.map(lambda a: a[index], maps)))
 
 
-class _LengthTable:
-    """Table of a function of the interval length; the arrays of its result are one row for each length.
-
-    One row is read at once, and written at once in reverse mode; array by array that took many more operations to
-    compile.
-
-    Args:
-        function: of a length, a scalar, to a pytree of arrays.
-        lengths: (U,).
-    """
-
-    def __init__(self, function: Callable[[jax.Array], Any], lengths: jax.Array) -> None:
-        leaves, self._tree = jax.tree.flatten(jax.vmap(function)(lengths))
-        self._shapes = [leaf.shape[1:] for leaf in leaves]
-        self._rows = jnp.concatenate([leaf.reshape(len(lengths), -1) for leaf in leaves], axis=1) if leaves else None
-
-    def value(self, index: jax.Array) -> Any:
-        """Return the value of the function for the length with this index."""
-        if self._rows is None:
-            return jax.tree.unflatten(self._tree, [])
-        row = jax.lax.dynamic_index_in_dim(self._rows, index, keepdims=False)
-        parts = jnp.split(row, np.cumsum([math.prod(shape) for shape in self._shapes])[:-1])
-        return jax.tree.unflatten(
-            self._tree, [part.reshape(shape) for part, shape in zip(parts, self._shapes, strict=True)])
-
-
 def by_length(grid: TimeGrid, make: Callable[[jax.Array], Any]) -> Callable[[Intervals], Any]:
     """Return the function interval -> ``make(length)``, tabulated for the distinct lengths where these are few."""
     if grid.lengths is None:
         return lambda interval: make(interval.length)
-    table = _LengthTable(make, jnp.asarray(grid.lengths))
-    return lambda interval: table.value(interval.length_index)
+    leaves, tree = jax.tree.flatten(jax.vmap(make)(jnp.asarray(grid.lengths)))
+    if not leaves:
+        return lambda interval: jax.tree.unflatten(tree, [])
+    shapes = [leaf.shape[1:] for leaf in leaves]
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    # One row for each length is read at once, and written at once in reverse mode; array by array that took many more
+    # operations to compile.
+    rows = jnp.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
+
+    def read(interval: Intervals) -> Any:
+        row = jax.lax.dynamic_index_in_dim(rows, interval.length_index, keepdims=False)
+        parts = jnp.split(row, ends[:-1])
+        return jax.tree.unflatten(tree, [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
+
+    return read
 
 
 def with_transitions(grid: TimeGrid, make: Callable[[jax.Array], Any]) -> TimeGrid:

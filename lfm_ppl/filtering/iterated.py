@@ -65,8 +65,8 @@ class _Iterate(NamedTuple):
     change: jax.Array
 
 
-def posterior_linearisation(problem: FilterProblem, updater: Updater, iterations: int, damping: float,
-                            initial: Moments | None = None) -> IterationResult:
+def posterior_linearisation(problem: FilterProblem, updater: Updater, iterations: int,
+                            damping: float) -> IterationResult:
     """Return the moments after a fixed number of iterations, so that they are smooth in the parameters.
 
     Args:
@@ -74,10 +74,9 @@ def posterior_linearisation(problem: FilterProblem, updater: Updater, iterations
         updater: how observations update the moments.
         iterations: number of forward and backward scans.
         damping: largest fraction of the new marginals that is taken, in (0, 1].
-        initial: moments at the initial time; None: the model's.
     """
     def smooth_about(points: LinearizationPoints | None) -> LinearizationPoints:
-        trace = forward(problem, updater, initial=initial, about=points, record=Record.LINEARIZATION)
+        trace = forward(problem, updater, about=points, record=Record.LINEARIZATION)
         return smoothed_points(problem, trace, backward(problem, trace, adjoint_only=True))
 
     def iterate(iterates: list[_Iterate | None], _: None) -> tuple[list[_Iterate | None], None]:

@@ -120,8 +120,11 @@ def is_linear(ssm: StateSpaceModel) -> bool:
             and not callable(ssm.model.process_noise))
 
 
-def at_intervals(a: jax.Array, intervals: Any) -> jax.Array:
-    """Return the entries of ``a`` (N, ...) at intervals; all of them without a gather, a scatter in reverse mode."""
-    if isinstance(intervals, np.ndarray) and np.array_equal(intervals, np.arange(a.shape[0])):
-        return a
-    return a[jnp.asarray(intervals)]
+def at_intervals(tree: Any, intervals: Any) -> Any:
+    """Return the entries of arrays (N, ...) at intervals; all of them without a gather, a scatter in reverse mode."""
+
+    def entries(a: jax.Array) -> jax.Array:
+        is_whole = isinstance(intervals, np.ndarray) and np.array_equal(intervals, np.arange(a.shape[0]))
+        return a if is_whole else a[jnp.asarray(intervals)]
+
+    return jax.tree.map(entries, tree)

@@ -4,8 +4,6 @@
 2. The model is linearised about the filter's moments, about iterated posterior moments, or about the moments that
    the sites of an observation family give.
 3. One forward and one backward scan give the smoothed moments at all nodes; draws come from the same forward scan.
-
-Source: Särkkä and Sarmavuori (2013), Signal Processing 93.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.arguments import as_rule, check_iterations, check_observations, warn_single_precision
-from lfm_ppl.filtering.backward import SmootherTrace, backward
+from lfm_ppl.filtering.backward import backward
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.evidence import evidence, leave_one_out
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter, quantile_residuals
@@ -28,8 +26,8 @@ from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.filter import whitened_innovations
 from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid
-from lfm_ppl.filtering.iterated import IterationResult, posterior_linearisation
-from lfm_ppl.filtering.moments import Record, matvec
+from lfm_ppl.filtering.iterated import posterior_linearisation
+from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
 from lfm_ppl.filtering.sample import sample_errors
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -199,8 +197,8 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         >>> lfm.smooth(model, jnp.arange(3.0), jnp.ones((3, 1)), at=jnp.linspace(0, 4, 5)).force("u").mean.shape
         (5,)
 
-    Source: Särkkä and Sarmavuori (2013); García-Fernández, Svensson and Särkkä (2017) for the iterations;
-    de Jong (1989), Biometrika 76, for the leave-one-out conditionals.
+    Source: Särkkä and Sarmavuori (2013), Signal Processing 93; García-Fernández, Svensson and Särkkä (2017) for the
+    iterations; de Jong (1989), Biometrika 76, for the leave-one-out conditionals.
     """
     rule = as_rule(rule)
     checks.one_of("method", method, METHODS)
@@ -217,71 +215,55 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     return result
 
 
-class FamilyScores(NamedTuple):
-    """Scores of the data of an observation family.
-
-    Attributes:
-        one_step_ahead: (T,), log p(y_k | y_1:k-1).
-        leave_one_out: (T,), log p(y_k | y_-k).
-        residual: (T, D), randomised quantile residuals.
-        converged: whether the sites have converged.
-    """
-
-    one_step_ahead: jax.Array
-    leave_one_out: jax.Array
-    residual: jax.Array
-    converged: jax.Array
+_Diagnostics = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
+"""Fields of a result from ``log_likelihood`` to ``converged``."""
 
 
 def smooth_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int, damping: float,
               settings: SiteSettings) -> SmootherResult:
     """Smooth on the intervals of a time grid, without checks; for compiled code."""
     problem = filter_problem(ssm, rule, grid)
-    scores = None
     if isinstance(ssm.model.observation, ObservationFamily):
-        trace, smoothed, iterated, scores = _smooth_family(problem, y, settings, ssm.model.observation)
+        trace, moments, diagnostics = _smooth_family(problem, y, settings, ssm.model.observation)
     else:
-        trace, smoothed, iterated = _smooth_gaussian(problem, y, iterations, damping)
+        trace, moments, diagnostics = _smooth_gaussian(problem, y, iterations, damping)
     times = jnp.asarray(grid.requested_times, float)
     requested = jnp.asarray(grid.requested)
-    mean, covariance = (a[requested + 1] for a in smoothed.moments)
+    mean, covariance = (a[requested + 1] for a in moments)
     matrix, offset = jax.vmap(ssm.input_map)(times)
-    if scores is None:
-        observed = jnp.asarray(grid.observed)
-        at_data = jax.tree.map(lambda a: a[observed], trace._replace(initial=None))
-        scores = FamilyScores(at_data.log_likelihood, smoothed.leave_one_out[observed],
-                              whitened_innovations(at_data, y), jnp.asarray(True))
     return SmootherResult(
-        times, mean, covariance, matvec(matrix, mean) + offset, congruence(matrix, covariance), *scores[:3],
-        jnp.asarray(jnp.nan) if iterated is None else iterated.change, scores.converged, trace, requested,
-        (matrix, offset), ssm.model.state_names, ssm.model.force_names)
+        times, mean, covariance, matvec(matrix, mean) + offset, congruence(matrix, covariance), *diagnostics, trace,
+        requested, (matrix, offset), ssm.model.state_names, ssm.model.force_names)
 
 
 def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int,
-                     damping: float) -> tuple[FilterTrace, SmootherTrace, IterationResult | None]:
-    updater, iterated = GaussianUpdate(y), None
+                     damping: float) -> tuple[FilterTrace, Moments, _Diagnostics]:
+    """Return the forward pass, the smoothed moments and the diagnostics."""
+    updater, points, change = GaussianUpdate(y), None, jnp.asarray(jnp.nan)
     if iterations:
-        iterated = posterior_linearisation(problem, updater, iterations, damping)
-    points = None if iterated is None else iterated.points
+        points, change = posterior_linearisation(problem, updater, iterations, damping)
     trace = forward(problem, updater, about=points, record=Record.SMOOTHER)
-    return trace, backward(problem, trace), iterated
+    smoothed = backward(problem, trace)
+    at_data, left_out = at_intervals((trace._replace(initial=None), smoothed.leave_one_out), problem.grid.observed)
+    residual = whitened_innovations(at_data, y)
+    return trace, smoothed.moments, (at_data.log_likelihood, left_out, residual, change, jnp.asarray(True))
 
 
-def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings, family: ObservationFamily
-                   ) -> tuple[FilterTrace, SmootherTrace, IterationResult | None, FamilyScores]:
+def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings,
+                   family: ObservationFamily) -> tuple[FilterTrace, Moments, _Diagnostics]:
+    """Return the same for an observation family."""
     result = evidence(problem, FamilyTerms(family, y), settings, record=Record.SMOOTHER)
     smoothed = backward(problem, result.trace)
     fixed_point, points = result.refined.fixed_point, result.refined.points
-    predictor = jax.tree.map(lambda a: at_intervals(a, problem.grid.observed), smoothed.predictor)
-    assert predictor is not None
+    predictor = at_intervals(smoothed.predictor, problem.grid.observed)
     prequential = assumed_density_filter(problem, y)
     fallback = -jnp.inf if points is None else prequential.log_likelihood
     left_out = leave_one_out(predictor, fixed_point.sites, result.entries)
-    scores = FamilyScores(jnp.where(fixed_point.converged, prequential.log_likelihood, fallback),
-                          jnp.where(fixed_point.converged, left_out, fallback),
-                          quantile_residuals(family, prequential.prediction, y), fixed_point.converged)
-    iterated = None if points is None else IterationResult(points, fixed_point.change)
-    return result.trace, smoothed, iterated, scores
+    one_step_ahead, left_out = (jnp.where(fixed_point.converged, value, fallback)
+                                for value in (prequential.log_likelihood, left_out))
+    change = jnp.asarray(jnp.nan) if points is None else fixed_point.change
+    residual = quantile_residuals(family, prequential.prediction, y)
+    return result.trace, smoothed.moments, (one_step_ahead, left_out, residual, change, fixed_point.converged)
 
 
 _compiled_smooth = eqx.filter_jit(smooth_on)

@@ -29,13 +29,12 @@ from lfm_ppl.filtering.grid_layout import (
     JUMP,
     OBSERVATION,
     GridLayout,
-    insert_traced_times,
     time_scale,
 )
 from lfm_ppl.filtering.intervals import TimeGrid, intervals_between
 from lfm_ppl.model.events import EventTable, check_start, event_table
 from lfm_ppl.model.inputs import InputRead, breakpoints_within
-from lfm_ppl.model.state_space import StateSpaceModel, check_times, inset
+from lfm_ppl.model.state_space import StateSpaceModel, check_times
 from lfm_ppl.utils import checks
 
 _LARGEST_TABLE = 1024
@@ -96,12 +95,11 @@ def lay_out_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: fl
     start = concrete_times[0] if initial_time is None and concrete_times is not None else initial_time
     origin = None if start is None else checks.concrete(start)
     is_adaptive = tolerance is not None
-    reads: list[InputRead] = []
     if concrete_times is None and _refuses_traced_times.get():
         raise ValueError("a time grid of traced times differs from that of their values.")
     if concrete_times is None or origin is None:
         division = Division(steps, max_step, interval_per_step, is_adaptive)
-        layout = GridLayout(_traced_grid(ssm, times, initial_time, requested_times, division, events))
+        layout, reads = _traced_layout(ssm, times, concrete_times, initial_time, requested_times, division, events)
     else:
         longest = max_step
         if max_step is None and not is_adaptive:
@@ -129,7 +127,8 @@ def refuse_traced_times() -> Iterator[None]:
 def _concrete_layout(ssm: StateSpaceModel, times: np.ndarray, origin: float, requested_times: Any,
                      division: Division, events: EventTable) -> tuple[GridLayout, list[InputRead]]:
     """Return the layout for times that are known before compilation, and the reads of known inputs."""
-    requested = None if requested_times is None else _requested_times(requested_times, origin)
+    requested = None if requested_times is None else checks.time_vector(
+        "at", requested_times, origin, remedy="; set the model's initial_time earlier to look further back")
     end = float(times[-1] if requested is None else requested.max(initial=times[-1]))
     ssm.model.check_inputs(origin, end)
     reads = ssm.model.input_reads(origin, end)
@@ -147,14 +146,14 @@ def _concrete_layout(ssm: StateSpaceModel, times: np.ndarray, origin: float, req
                       tuple(events.is_traced.tolist())), reads
 
 
-def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_times: Any,
-                 division: Division, events: EventTable) -> TimeGrid:
-    """Return the time grid for times, or an initial time, that are traced."""
-    concrete_times = check_times(times, initial_time)
+def _traced_layout(ssm: StateSpaceModel, times: Any, concrete_times: np.ndarray | None, initial_time: Any,
+                   requested_times: Any, division: Division,
+                   events: EventTable) -> tuple[GridLayout, list[InputRead]]:
+    """Return the layout for times, or an initial time, that are traced: all breakpoints and events are inserted."""
     span = (0.0, 1.0) if concrete_times is None else (float(concrete_times[0]), float(concrete_times[-1]))
     reads = ssm.model.input_reads(*span)
-    breakpoints = jnp.concatenate([jnp.zeros(0), *(jnp.asarray(read.breakpoints(), float) for read in reads)])
-    division = replace(division, traced_breakpoints=len(breakpoints) + len(events.times), scale=time_scale(reads))
+    rows = tuple(read.breakpoint_rows for read in reads)
+    division = replace(division, traced_breakpoints=sum(map(len, rows)) + len(events.times))
     jumps, steps = ssm.stack.jump_times, division.steps
     is_concrete_request = requested_times is not None and not checks.traced(requested_times)
     if concrete_times is not None and jumps and division.max_step is None and requested_times is None:
@@ -168,10 +167,7 @@ def _traced_grid(ssm: StateSpaceModel, times: Any, initial_time: Any, requested_
         pieces = -(-steps // part)
         grid = (_grid_from_traced_times(times, pieces, part, initial_time) if requested_times is None
                 else _grid_from_traced_request(times, pieces, part, initial_time, requested_times))
-    intervals = grid.intervals
-    inner = inset(intervals.start, intervals.end, intervals.length, division.scale)
-    return insert_traced_times(grid._replace(intervals=intervals._replace(inset=inner)), breakpoints, events,
-                               np.full(len(events.times), True), division.scale)
+    return GridLayout(grid, rows, (True,) * len(rows), (True,) * len(events.times)), reads
 
 
 def _grid_from_traced_request(times: Any, pieces: int, steps: int, initial_time: Any, requested_times: Any) -> TimeGrid:
@@ -316,11 +312,6 @@ def _separate_breakpoints(breakpoints: np.ndarray, times: np.ndarray, scale: Any
     is_time = np.minimum(np.abs(times[right] - breakpoints), np.abs(times[right - 1] - breakpoints)) <= rounding
     separate = breakpoints[~is_time]
     return separate[np.diff(separate, prepend=-np.inf) > rounding]
-
-
-def _requested_times(requested_times: Any, origin: float) -> np.ndarray:
-    return checks.time_vector("at", requested_times, origin,
-                              remedy="; set the model's initial_time earlier to look further back")
 
 
 def _group_lengths(length: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:

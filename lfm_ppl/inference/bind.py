@@ -70,7 +70,7 @@ def bind(model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y: ArrayLi
         >>> both = lfm.bind(experiments, {"short": times[:3], "long": times},
         ...                 {"short": np.ones((3, 1)), "long": np.sin(times)[:, None]})
         >>> both.site_models["short"].smooth(z).mean.shape
-        (3, 1)
+        (3, 3)
         >>> bool(jnp.isclose(both.site_models["long"].log_likelihood(z), bound.log_likelihood(z)))
         True
 

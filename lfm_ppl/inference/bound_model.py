@@ -23,7 +23,7 @@ from lfm_ppl.filtering.filter import FilterResult
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.settings import approximate
-from lfm_ppl.inference.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood
+from lfm_ppl.inference.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood, single_site
 from lfm_ppl.inference.model_arguments import ModelArguments, signature
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.panel import Panel
@@ -61,11 +61,13 @@ class BoundModel:
         names: names of the d unconstrained coordinates: sites sorted by name, elements in C order.
         size: d.
         sites: names of the latent sites.
+        model: the NumPyro model.
         traced: the model without its data.
     """
 
     def __init__(self, traced: TracedModel, y: ArrayLike, selected: str | None = None) -> None:
         self.traced = traced
+        self.names, self.size, self.sites, self.model = traced.names, traced.size, traced.sites, traced.model
         self.model_data: Any = y
         self._selected = selected
         self._trace: dict[str, Any] | None = None
@@ -93,32 +95,12 @@ class BoundModel:
         return {name: BoundModel(self.traced, self.model_data, name) for name in self.traced.arguments[0]}
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the unconstrained coordinates."""
-        return self.traced.names
-
-    @property
-    def size(self) -> int:
-        """Number of unconstrained coordinates."""
-        return self.traced.size
-
-    @property
-    def sites(self) -> tuple[str, ...]:
-        """Names of the latent sites."""
-        return self.traced.sites
-
-    @property
     def times(self) -> Any:
         """Times of the observations, (T,), or (B, T) for a panel whose series have different times; a dict by site."""
         times = self.traced.arguments[0]
         if self.is_by_site:
             return times if self._selected is None else times[self._selected]
         return np.asarray(times, float)
-
-    @property
-    def model(self) -> Callable:
-        """The NumPyro model."""
-        return self.traced.model
 
     @property
     def forward_mode(self) -> bool:
@@ -132,15 +114,12 @@ class BoundModel:
         Raises:
             ValueError: the model has no such site, or several.
         """
-        return self.traced.site(self._selected)
+        return single_site(self.traced.likelihoods, self._selected)
 
     @property
     def has_likelihood(self) -> bool:
         """Whether the model has one likelihood site."""
-        try:
-            return self.site is not None
-        except ValueError:
-            return False
+        return self._selected is not None or len(self.traced.likelihoods) == 1
 
     def __repr__(self) -> str:
         """Return the model's name and its parameters."""

@@ -195,7 +195,7 @@ class ConstrainedLikelihood(SeriesLikelihood):
         predictor = backward(posterior.problem, propagated.trace).predictor
         assert predictor is not None
         data, outputs = jnp.asarray(posterior.rows.data), y.shape[1]
-        at_data = jax.tree.map(lambda a: at_intervals(a, posterior.grid.observed)[data], predictor)
+        at_data = jax.tree.map(lambda a: a[data], at_intervals(predictor, posterior.grid.observed))
         at_data = at_data._replace(mean=at_data.mean[:, :outputs],
                                    covariance=at_data.covariance[:, :outputs, :outputs])
         fixed_point = propagated.refined.fixed_point

@@ -6,8 +6,6 @@
    the log evidence of the converged sites (`lfm_ppl.filtering.ep`).
 3. Constraints: `ConstrainedLikelihood`.
 4. A failure inside compiled code is a log density of -inf with zero gradients; outside of it a warning names the row.
-
-Source: Hartikainen et al. (2012), section 4; Singer (2011), AStA 95.
 """
 
 from __future__ import annotations
@@ -141,12 +139,10 @@ class MarginalLikelihood(SeriesLikelihood):
         self.tolerance, self.method = None if tolerance is None else float(tolerance), method
         self.sites = None if sites is None else as_settings(sites)
         super().__init__(model, times, rule, steps)
-        self.iterations = self._default_iterations() if iterations is None else iterations
-
-    def _default_iterations(self) -> int:
-        """Return the number of iterations of posterior linearisation where the user gives none."""
-        is_single_pass = self.is_family or self.tolerance is not None or self.is_affine
-        return 0 if is_single_pass else DEFAULT_ITERATIONS
+        if iterations is None:
+            is_single_pass = self.is_family or tolerance is not None or self.is_affine
+            iterations = 0 if is_single_pass else DEFAULT_ITERATIONS
+        self.iterations = iterations
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -9,9 +9,11 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterator
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,25 +24,16 @@ _ARRAY = object()
 """Marks the place of an array among the static leaves."""
 
 
+@dataclass(frozen=True)
 class _Structure:
-    """Everything of a pytree but its arrays, compared by value."""
+    """Everything of a pytree but its arrays, compared by the signatures of its leaves."""
 
-    def __init__(self, tree: Any, leaves: tuple[Any, ...]) -> None:
-        self.tree, self.leaves = tree, leaves
-        self._key = tree, tuple(_leaf_signature(leaf) for leaf in leaves)
-        self._hash = hash(self._key)
-
-    def __eq__(self, candidate: object) -> bool:
-        """Return whether both have equal leaves in equal places."""
-        return isinstance(candidate, _Structure) and candidate._key == self._key
-
-    def __hash__(self) -> int:
-        """Return the hash of the signatures."""
-        return self._hash
+    tree: Any
+    leaves: tuple[Any, ...] = field(compare=False)
+    signatures: tuple[Hashable, ...]
 
 
-@jax.tree_util.register_pytree_node_class
-class ModelInputs:
+class ModelInputs(eqx.Module):
     """Times, keyword arguments and time grids of a model; its leaves are their arrays.
 
     Arrays of real numbers are leaves, and so are the index arrays of a time grid. Integers among the arguments of a
@@ -48,8 +41,8 @@ class ModelInputs:
     then reads its results without a gather.
     """
 
-    def __init__(self, arrays: Iterable[Any], structure: _Structure) -> None:
-        self._arrays, self._structure = tuple(arrays), structure
+    arrays: tuple[Any, ...]
+    structure: _Structure = eqx.field(static=True)
 
     @classmethod
     def of(cls, arguments: Any, layouts: Any) -> ModelInputs:
@@ -58,25 +51,17 @@ class ModelInputs:
         is_array += [isinstance(leaf, (np.ndarray, jax.Array)) and not _is_range(leaf)
                      for leaf in jax.tree.leaves(layouts)]
         leaves, tree = jax.tree.flatten((arguments, layouts))
-        return cls((jnp.asarray(checks.unmask(leaf)) for leaf, flag in zip(leaves, is_array, strict=True) if flag),
-                   _Structure(tree, tuple(_ARRAY if flag else leaf
-                                          for leaf, flag in zip(leaves, is_array, strict=True))))
+        pairs = list(zip(leaves, is_array, strict=True))
+        static = tuple(_ARRAY if flag else leaf for leaf, flag in pairs)
+        return cls(tuple(jnp.asarray(checks.unmask(leaf)) for leaf, flag in pairs if flag),
+                   _Structure(tree, static, tuple(map(_leaf_signature, static))))
 
     @property
     def value(self) -> tuple[Any, Any]:
         """The arguments and the layouts."""
-        arrays = iter(self._arrays)
-        return jax.tree.unflatten(self._structure.tree, [next(arrays) if leaf is _ARRAY else leaf
-                                                         for leaf in self._structure.leaves])
-
-    def tree_flatten(self) -> tuple[tuple[Any, ...], _Structure]:
-        """Return the arrays and the structure."""
-        return self._arrays, self._structure
-
-    @classmethod
-    def tree_unflatten(cls, structure: _Structure, arrays: Iterable[Any]) -> ModelInputs:
-        """Return the inputs with other arrays."""
-        return cls(arrays, structure)
+        arrays = iter(self.arrays)
+        return jax.tree.unflatten(self.structure.tree, [next(arrays) if leaf is _ARRAY else leaf
+                                                        for leaf in self.structure.leaves])
 
 
 class ModelArguments(NamedTuple):

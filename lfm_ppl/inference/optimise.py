@@ -70,16 +70,14 @@ class Objective:
         value, gradient = self.program(jnp.asarray(point))
         return float(value), np.asarray(gradient, float)
 
-    def _gradient(self, point: np.ndarray) -> np.ndarray:
-        return self.value_and_gradient(point)[1]
-
     def curvature(self, point: np.ndarray) -> Curvature | None:
         """Return the curvature; None where the Hessian is not finite."""
         hessian, noise = None, _EXACT_NOISE
         if self.hessian is not None:
             hessian = np.asarray(self.hessian(jnp.asarray(point)), float)
         if hessian is None or not np.all(np.isfinite(hessian)):
-            hessian, noise = finite_difference_hessian(self._gradient, point), _DIFFERENCE_NOISE
+            hessian = finite_difference_hessian(lambda point: self.value_and_gradient(point)[1], point)
+            noise = _DIFFERENCE_NOISE
         return decompose(hessian, noise) if np.all(np.isfinite(hessian)) else None
 
 

@@ -59,7 +59,7 @@ class ParticleLikelihood(dist.Distribution):
         value = jnp.asarray(checks.unmask(value), float)
         if isinstance(self.base, Panel):
             keys = jax.random.split(self.key, self.base.batch_shape[0])
-            return self.base.mapped(lambda series, y, key: self._series_log_prob(series, y, key), value, keys)
+            return self.base.mapped(self._series_log_prob, value, keys)
         return self._series_log_prob(self.base, value, self.key)
 
     def _series_log_prob(self, base: SeriesLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
@@ -151,7 +151,7 @@ class ParticlePotential:
         settings = self.settings if particles is None else self.settings._replace(particles=particles)
         return -self._bound.log_density_with(lambda model: with_particles(model, key, settings, self._steps), z, y)
 
-    def tune(self, z: Any, key: jax.Array, target_sd: float = 1.0) -> Tuned:
+    def tune(self, z: Any, key: jax.Array) -> Tuned:
         """Choose the number of particles for which the log likelihood at ``z`` has a standard deviation near 1.
 
         The variance is inversely proportional to the number. Fewer particles make the chain stick to lucky
@@ -160,18 +160,16 @@ class ParticlePotential:
         Args:
             z: (d,) unconstrained parameters, as central in the posterior as they are known to be.
             key: a JAX random key.
-            target_sd: the standard deviation needed.
 
         Raises:
             ValueError: at ``z`` the estimates are not finite, or no number up to 200,000 is enough.
 
         Source: Doucet, Pitt, Deligiannidis and Kohn (2015), Biometrika 102(2).
         """
-        checks.positive("target_sd", target_sd)
         particles = 200
         for attempt in range(8):
             sd = self.sd_of_estimates(z, jax.random.fold_in(key, attempt), particles)
-            needed_particles = int(np.ceil(particles * np.clip((sd / target_sd) ** 2, 1 / 64, 8.0)))
+            needed_particles = int(np.ceil(particles * np.clip(sd**2, 1 / 64, 8.0)))
             is_close = particles / 1.4 < needed_particles < particles * 1.4
             if is_close or (particles == _FEWEST and needed_particles <= _FEWEST):
                 return Tuned(particles, sd)
@@ -181,7 +179,7 @@ class ParticlePotential:
         if np.isfinite(sd) and particles < _MOST:
             return Tuned(particles, sd)
         raise ValueError(f"the log likelihood estimate has a standard deviation of {sd:.3g} with {_MOST} particles; "
-                         f"{target_sd:g} is out of reach. The observations may be too precise, or too many, for a "
+                         "1 is out of reach. The observations may be too precise, or too many, for a "
                          "bootstrap filter, or the starting point is far from the posterior; give particles yourself.")
 
     def sd_of_estimates(self, z: Any, key: jax.Array, particles: int) -> float:

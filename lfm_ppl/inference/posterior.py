@@ -60,14 +60,11 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *,
         of each site has the name of the site after `LOG_PRIOR`.
     """
 
-    def score_series(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
-        return distribution.scores(key, y)
-
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         log_priors = {LOG_PRIOR + name: value for name, value in bound.site_log_priors(values, y).items()}
         distribution, y = bound.likelihood(values, y), bound.data(y)
         keys = jax.random.split(key, y.shape[0]) if isinstance(distribution, Panel) else key
-        return map_series(distribution, score_series, y, keys) | log_priors
+        return map_series(distribution, lambda series, y, key: series.scores(key, y), y, keys) | log_priors
 
     return map_draws(bound, "scores", SharedFunction(per_draw), draws, jax.random.key(0), rows=bound.times.size,
                      report=report, store=store)

@@ -282,12 +282,9 @@ class _BlockProgram:
         steps = first, end, self._schedule.warmup, self._schedule.thin
         if not self._is_sequential:
             return self._advance(state, rows, *steps, self._argument)
-        results = [self._advance(*self._chain(state, rows, chain), *steps, self._argument)
-                   for chain in range(self._chains)]
-        return jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *results)
-
-    def _chain(self, state: Any, rows: Any, chain: int) -> tuple[Any, Any]:
-        return jax.tree_util.tree_map(lambda leaf: leaf[chain], (state, rows))
+        chains = (jax.tree.map(lambda leaf, chain=chain: leaf[chain], (state, rows)) for chain in range(self._chains))
+        results = [self._advance(*chain, *steps, self._argument) for chain in chains]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
 
 
 def _advance(sampler: BoundSampler, method: str, mesh: Mesh | None) -> Callable:

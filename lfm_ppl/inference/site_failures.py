@@ -12,7 +12,6 @@ import numpy as np
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.map_draws import SharedFunction, map_draws, map_series
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 
 POINTS = 100
 """Points at which the likelihood is evaluated."""
@@ -51,7 +50,7 @@ class PathESS:
     least: float
 
 
-def site_failures(bound: BoundModel, z: np.ndarray, seed: int = 0, points: int = POINTS) -> SiteFailures | None:
+def site_failures(bound: BoundModel, z: np.ndarray, seed: int = 0) -> SiteFailures | None:
     """Evaluate the likelihood at proposals of a sampler: draws plus scaled differences of two other draws.
 
     At draws themselves the likelihood is never zero, because a sampler rejects such points. The proposals of
@@ -61,7 +60,6 @@ def site_failures(bound: BoundModel, z: np.ndarray, seed: int = 0, points: int =
         bound: the model and its data.
         z: draws (C, S, d) of the unconstrained parameters.
         seed: seed of the choice of draws.
-        points: number of points.
 
     Returns:
         Counts; None for a model of Gaussian observations without constraints, which has no sites.
@@ -71,32 +69,29 @@ def site_failures(bound: BoundModel, z: np.ndarray, seed: int = 0, points: int =
     if not bound.site.example.has_sites or not z.size:
         return None
     flat = z.reshape(-1, z.shape[-1])
-    first, second, third = np.random.default_rng(seed).integers(len(flat), size=(3, points))
+    first, second, third = np.random.default_rng(seed).integers(len(flat), size=(3, POINTS))
     proposals = flat[first] + 2.38 / np.sqrt(2.0 * flat.shape[1]) * (flat[second] - flat[third])
-    return failures_at(bound, bound.constrain_draws(proposals), points)
+    return failures_at(bound, bound.constrain_draws(proposals))
 
 
-def failures_at(bound: BoundModel, values: Mapping[str, Any], limit: int = POINTS) -> SiteFailures | None:
-    """Evaluate the likelihood at values of the sites, name -> (S, ...), or at ``limit`` of them; None as above."""
+def failures_at(bound: BoundModel, values: Mapping[str, Any]) -> SiteFailures | None:
+    """Evaluate the likelihood at values of the sites, name -> (S, ...), or at `POINTS` of them; None as above."""
     if not bound.site.example.has_sites:
         return None
 
-    def evaluate(distribution: SeriesLikelihood, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return distribution.convergence(y)
-
     def per_draw(values: Any, key: jax.Array, y: Any) -> tuple[jax.Array, jax.Array]:
-        return map_series(bound.likelihood(values, y), evaluate, bound.data(y))
+        return map_series(bound.likelihood(values, y), lambda series, y: series.convergence(y), bound.data(y))
 
     def in_all_series(flags: Any) -> np.ndarray:
         return np.all(np.asarray(flags).reshape(len(flags), -1), axis=1)
 
     converged, possible = map(in_all_series, map_draws(
-        bound, "convergence of the sites", SharedFunction(per_draw), _evenly_spaced(values, limit), jax.random.key(0),
+        bound, "convergence of the sites", SharedFunction(per_draw), _evenly_spaced(values, POINTS), jax.random.key(0),
         rows=bound.times.size))
     return SiteFailures(len(converged), int((~converged).sum()), int((~possible).sum()))
 
 
-def path_ess(bound: BoundModel, values: Mapping[str, Any], limit: int = _WEIGHT_DRAWS) -> PathESS | None:
+def path_ess(bound: BoundModel, values: Mapping[str, Any]) -> PathESS | None:
     """Return the effective sample size of weighted trajectories at values of the sites, name -> (S, ...).
 
     It is None without constraints, and where expectation propagation alone gives the evidence under constraints.
@@ -109,8 +104,8 @@ def path_ess(bound: BoundModel, values: Mapping[str, Any], limit: int = _WEIGHT_
         distribution = cast(ConstrainedLikelihood, bound.likelihood(values, y))
         return distribution.truncated_posterior().effective_sample_size(bound.data(y), distribution.draws)
 
-    sizes = map_draws(bound, "weights of trajectories", per_draw, _evenly_spaced(values, limit), jax.random.key(0),
-                      rows=bound.times.size)
+    sizes = map_draws(bound, "weights of trajectories", per_draw, _evenly_spaced(values, _WEIGHT_DRAWS),
+                      jax.random.key(0), rows=bound.times.size)
     return PathESS(example.draws, float(np.median(sizes)), float(sizes.min()))
 
 

@@ -36,28 +36,18 @@ def start_failure(bound: BoundModel) -> str:
 
 def _site_failure(bound: BoundModel) -> str | None:
     """Return a sentence on the prior, factor or further observed site whose log density is not finite."""
+    likelihoods = {site.name for site in bound.traced.likelihoods}
     for name, site in bound.trace().items():
-        law = site.get("fn")
-        if site["type"] != "sample" or _is_likelihood(law):
+        if site["type"] != "sample" or name in likelihoods:
             continue
         if not site["is_observed"] and not np.isfinite(np.asarray(site["value"], float)).all():
-            return (f"the value of {name!r} is not finite ({_format_array(site['value'])}): check the parameters of "
-                    "its prior.")
-        total = float(jnp.sum(law.log_prob(site["value"])))
+            value = np.array2string(np.asarray(site["value"], float), threshold=5, separator=", ").replace("\n", "")
+            return f"the value of {name!r} is not finite ({value}): check the parameters of its prior."
+        total = float(jnp.sum(site["fn"].log_prob(site["value"])))
         if not np.isfinite(total):
             kind = "site" if site["is_observed"] else "prior of"
             return f"the {kind} {name!r} has the log density {total:g}."
     return None
-
-
-def _is_likelihood(law: Any) -> bool:
-    while hasattr(law, "base_dist") and not isinstance(law, (SeriesLikelihood, Panel)):
-        law = law.base_dist
-    return isinstance(law, (SeriesLikelihood, Panel))
-
-
-def _format_array(value: Any) -> str:
-    return np.array2string(np.asarray(value, float), threshold=5, separator=", ").replace("\n", "")
 
 
 def _likelihood_failure(bound: BoundModel, z: Any) -> str | None:

@@ -34,14 +34,7 @@ from numpyro.infer.util import constrain_fn, potential_energy
 from numpyro.infer.util import log_density as constrained_log_density
 
 from lfm_ppl.filtering.time_grid import refuse_traced_times
-from lfm_ppl.inference.likelihood_site import (
-    LikelihoodSite,
-    SiteTimes,
-    likelihood_sites,
-    record_likelihoods,
-    replace_times,
-    single_site,
-)
+from lfm_ppl.inference.likelihood_site import SiteTimes, likelihood_sites, record_likelihoods, replace_times
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.model_arguments import ModelArguments, ModelInputs, shapes, signature, variables_of
 from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, latent_sites
@@ -226,10 +219,6 @@ class TracedModel:
         if self.data_index is not None:
             jax.eval_shape(run, shapes(self._example))
         return names
-
-    def site(self, name: str | None = None) -> LikelihoodSite:
-        """Return the likelihood site at the prior's medians, of several the one with this name."""
-        return single_site(self.likelihoods, name)
 
     def trace(self, y: Any) -> dict[str, Any]:
         """Return NumPyro's trace of the model at the prior's medians."""

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-import jax
 import numpy as np
-from numpyro import handlers
-from numpyro.infer import init_to_uniform
 
 
 def latent_sites(trace: Mapping[str, Any]) -> dict[str, Any]:
@@ -16,28 +13,8 @@ def latent_sites(trace: Mapping[str, Any]) -> dict[str, Any]:
     return {name: site for name, site in trace.items() if site["type"] == "sample" and not site["is_observed"]}
 
 
-def check_latent_sites(
-    model: Callable, args: tuple, kwargs: Mapping[str, Any], rng_key: jax.Array, user: str
-) -> None:
-    """Raise ValueError unless every latent site of a model is continuous and there is at least one.
-
-    Args:
-        model: a NumPyro model.
-        args: its positional arguments.
-        kwargs: its keyword arguments.
-        rng_key: key for the values of the latent sites.
-        user: who asks, for the message.
-
-    Raises:
-        ValueError: a latent site is discrete, or no latent site is left to sample.
-    """
-    # init_to_uniform also serves improper priors, from which nothing can be drawn
-    seeded_model = handlers.substitute(handlers.seed(model, rng_key), substitute_fn=init_to_uniform)
-    check_latent(latent_sites(handlers.trace(seeded_model).get_trace(*args, **kwargs)), user)
-
-
 def check_latent(sites: Mapping[str, Any], user: str) -> None:
-    """Raise ValueError unless latent sites are continuous and there is at least one; see `check_latent_sites`."""
+    """Raise ValueError unless latent sites are continuous and there is at least one; ``user`` is for the message."""
     discrete = [name for name, site in sites.items() if site["fn"].support.is_discrete]
     if discrete:
         raise ValueError(

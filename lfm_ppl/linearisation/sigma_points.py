@@ -32,7 +32,7 @@ import numpy as np
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
 from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import CholeskyFactor, cholesky, congruence, matmul, outer_square
+from lfm_ppl.utils.linalg import cholesky, congruence, matmul, outer_square
 
 _MOST_POINTS = 10_000
 """Largest number of points of a rule: its residual weights, a square matrix, then take 0.8 GB."""
@@ -95,7 +95,7 @@ class SigmaPointRule(Rule):
         factor = cholesky(inputs.covariance[:count, :count], inputs.min_sd**2)
         chol = factor.chol
         # Conditional mean of the averaged inputs given the node xi: m_r + gain xi with gain = P_ra L^-T.
-        gain = _times_inverse_transpose(factor, inputs.covariance[count:, :count])
+        gain = factor.solve_lower(inputs.covariance[count:, :count].T).T
         root = jnp.concatenate([chol, gain]) if structure.averaged else chol
         input_root = matmul(selection((*structure.nonlinear, *structure.averaged), size), root)
         sigma_points = inputs.mean + matmul(nodes, input_root.T)
@@ -110,7 +110,7 @@ class SigmaPointRule(Rule):
         # The regression of the values on the nodes is (slope L + mean_jacobian gain): both kinds of inputs follow xi.
         if self.is_regression:
             regression = matmul((weights[:, None] * values).T, nodes)
-            slope = _times_inverse(factor, regression - averaged_regression)
+            slope = factor.solve_upper((regression - averaged_regression).T).T
         else:
             _, slope = _average_jacobian(function, sigma_points, weights, structure.nonlinear)
             regression = matmul(slope, chol) + averaged_regression
@@ -137,16 +137,6 @@ def _average_jacobian(function: Function, sigma_points: jax.Array, weights: jax.
     """Return the Jacobians (p, D, len(indices)) at the sigma points, and their weighted average."""
     jacobians = jax.vmap(lambda v: partial_jacobian(function, v, indices))(sigma_points)
     return jacobians, (weights[:, None, None] * jacobians).sum(0)
-
-
-def _times_inverse_transpose(factor: CholeskyFactor, b: jax.Array) -> jax.Array:
-    """Return ``B L^-T`` (m, n)."""
-    return factor.solve_lower(b.T).T
-
-
-def _times_inverse(factor: CholeskyFactor, b: jax.Array) -> jax.Array:
-    """Return ``B L^-1`` (m, n)."""
-    return factor.solve_upper(b.T).T
 
 
 def _linearise_without_points(function: Function, inputs: Inputs, structure: InputStructure,

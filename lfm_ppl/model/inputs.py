@@ -192,11 +192,7 @@ def input_reads(functions: Sequence[TracedFunction], first: float, last: float) 
 def _is_read_in_place(function: TracedFunction, position: int, first: float, last: float) -> bool:
     """Return whether an input is read at t, clipped to an interval, so that its breakpoints are times of the model.
 
-    Args:
-        function: function of (x, u, t) or of t.
-        position: index of the read among all reads of the function.
-        first: a time of the model.
-        last: a later time of the model.
+    ``position`` is the index of the read among all reads of the function.
     """
     if checks.traced(function.closed.consts):
         return False

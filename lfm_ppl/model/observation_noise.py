@@ -32,7 +32,7 @@ def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array
     present = jnp.isfinite(y)
     family = ssm.model.observation
     if isinstance(family, ObservationFamily):
-        return entry_log_prob(ssm, w, t, row, y).sum(), jnp.full(y.shape, jnp.nan)
+        return row_log_prob(family, row, ssm.observe(w, t), y).sum(), jnp.full(y.shape, jnp.nan)
     residual = jnp.where(present, y, 0.0) - ssm.observe(w, t)
     for index in ssm.model.observation.angular:
         residual = residual.at[index].set(wrapped(residual[index]))
@@ -43,14 +43,11 @@ def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array
     return jnp.where(factor.degenerate.any(), -jnp.inf, value), white
 
 
-def entry_log_prob(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: Any, y: jax.Array) -> jax.Array:
-    """Return log p(y_d | w) (D,) of the entries of a family, zero where missing; arguments as in `log_density`."""
-    family, present = ssm.model.observation, jnp.isfinite(y)
-    assert isinstance(family, ObservationFamily)
-    predictor = ssm.observe(w, t)
+def row_log_prob(family: ObservationFamily, row: Any, f: jax.Array, y: jax.Array) -> jax.Array:
+    """Return log p(y_d | f_d) (D,) of a row at a predictor f (D,), zero where missing."""
+    present = jnp.isfinite(y)
     # The masked branch must have a finite derivative, too: replace a missing entry by a value in the support.
-    value = family.select_row(row).log_prob(predictor, jnp.where(present, y, family.possible(predictor)))
-    return jnp.where(present, value, 0.0)
+    return jnp.where(present, family.select_row(row).log_prob(f, jnp.where(present, y, family.possible(f))), 0.0)
 
 
 def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax.Array, row: Any) -> jax.Array:

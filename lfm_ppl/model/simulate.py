@@ -8,8 +8,6 @@
 5. Process noise enters with the dispersion at the start of the step (Ito), spread evenly over the step.
 6. At the end of a step that crosses a jump of a force, draw the jump. Events end intervals, like breakpoints.
 7. Draw the observations at the rows from the noise or the observation family.
-
-Source: Kloeden and Platen (1992), Numerical Solution of Stochastic Differential Equations, section 9.1.
 """
 
 from __future__ import annotations
@@ -74,7 +72,7 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
         >>> lfm.simulate(jax.random.key(0), model, jnp.arange(4.0)).y.shape
         (4, 1)
 
-    Source: Kloeden and Platen (1992), section 9.1.
+    Source: Kloeden and Platen (1992), Numerical Solution of Stochastic Differential Equations, section 9.1.
     """
     checks.random_key(key)
     checks.positive_integer("steps", steps)
@@ -254,16 +252,9 @@ def _interval_integrator(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.
 
 def _simulation_step(ssm: StateSpaceModel, state: jax.Array, span: Span, h: jax.Array, transition: jax.Array,
                      root: jax.Array, key: jax.Array) -> jax.Array:
-    """Return the joint state (n,) after one integration step of length h.
+    """Return the joint state (n,) after one integration step of length h from the start of ``span``.
 
-    Args:
-        ssm: the state-space model.
-        state: (n,), the joint state at the start of the step.
-        span: the remaining span of the interval, which starts at the start of the step.
-        h: step length.
-        transition: of the forces over the step.
-        root: square root of the process noise of the forces over the step.
-        key: random key of the step.
+    ``transition`` is that of the forces over the step, ``root`` a square root of their process noise.
     """
     size = ssm.physical_dim
     force_key, state_key = jax.random.split(key)

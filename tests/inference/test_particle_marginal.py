@@ -1,6 +1,5 @@
 """Particle-marginal RAM: exact whatever the noise of the estimate, and whatever the surrogate."""
 
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +12,8 @@ from numpyro.infer import MCMC
 import lfm_ppl as lfm
 from lfm_ppl.inference import particle_likelihood
 from lfm_ppl.inference.bind import bind
-from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalState, particle_marginal_step
-from lfm_ppl.inference.kernels.robust_metropolis import initial_state
+from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalState, particle_marginal
+from lfm_ppl.inference.kernels.robust_metropolis import Adaptation, initial_state
 from lfm_ppl.inference.particle_likelihood import ParticlePotential
 from lfm_ppl.inference.posterior import trajectories
 from lfm_ppl.particles.particle_filter import ParticleSettings
@@ -89,8 +88,9 @@ def test_noise_and_a_wrong_surrogate_leave_the_target_alone(surrogate):
         zero = jnp.zeros(())
         start = ParticleMarginalState(initial_state(zero, zero, key, 2.4 * jnp.eye(1), 0),
                                       zero if surrogate is None else surrogate(zero), jnp.array(False), key)
-        step = partial(particle_marginal_step, estimate, surrogate, None, 2 / 3, False)
-        return jax.lax.scan(lambda s, _: ((new := step(s)), new.z), start, length=20_000)[1]
+        surrogate_at = None if surrogate is None else lambda data: surrogate
+        algorithm = particle_marginal(lambda data: estimate, surrogate_at, Adaptation(None, 2 / 3, False), 0)
+        return jax.lax.scan(lambda s, _: ((new := algorithm.step(s, None)), new.z), start, length=20_000)[1]
 
     draws = np.asarray(jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(1), 16)))[:, 500:]
     for power, moment in ((1, 0.0), (2, 1.0), (4, 3.0)):

@@ -90,19 +90,18 @@ class Evidence(NamedTuple):
     refined: RefinedSites
 
 
-def evidence(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, *, initial: Moments | None = None,
-             first: Sites | None = None, record: Record = Record.LIKELIHOOD) -> Evidence:
+def evidence(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, *, first: Sites | None = None,
+             record: Record = Record.LIKELIHOOD) -> Evidence:
     """Return the log evidence of a model with sites, with a derivative.
 
     Args:
         problem: the model, the rule and the time grid.
         terms: factors that the sites approximate.
         settings: how the sites are refined.
-        initial: moments at the initial time; None: the model's.
         first: first sites; None: see step 1 above, for an observation family.
         record: recorded output of the last forward scan.
     """
-    initial = problem.initial(initial)
+    initial = problem.initial()
     refined = refine(problem, terms, settings, initial, first)
     fixed_point = refined.fixed_point
     cavity = fixed_point.cavity
@@ -129,7 +128,7 @@ def evidence(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, 
 
 def refine(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, initial: Moments,
            first: Sites | None = None) -> RefinedSites:
-    """Refine sites until they do not change; arguments as in `evidence`.
+    """Refine sites until they do not change; ``initial`` are moments, other arguments as in `evidence`.
 
     Where the sites of a non-linear model do not converge, the result has the sites of assumed density filtering,
     without negative precisions: with them a variance could be negative about other points.
@@ -157,7 +156,7 @@ def refine(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, in
         return RefinedSites(fixed_point, points, maps, jnp.asarray(-jnp.inf))
     fallback = stop_gradient_of_call(lambda fixed_point, sites: jax.tree.map(
         functools.partial(jnp.where, fixed_point.converged), fixed_point.sites, sites), fixed_point,
-        clip_to_proper(_sites_of(problem, trace)))
+        clip_to_proper(at_intervals(trace.update.site_terms.sites, problem.grid.observed)))
     return RefinedSites(fixed_point._replace(sites=fallback), points, maps, trace.log_likelihood.sum())
 
 
@@ -170,7 +169,7 @@ def _sites_from_prior(problem: FilterProblem, terms: FamilyTerms, initial: Momen
     """
     empty = jnp.zeros_like(terms.y)
     trace = forward(problem, SiteUpdate(Sites(empty, empty, empty)), initial=initial, record=Record.MOMENTS, maps=maps)
-    prior = jax.tree.map(lambda a: at_intervals(a, problem.grid.observed), trace.update.site_terms)
+    prior = at_intervals(trace.update.site_terms, problem.grid.observed)
     mean, variance = prior.value, diagonal(prior.variance)
     cavity = with_positive_variance(mean, variance)
     tilted = terms.tilted(cavity, tilted_mode(terms.log_prob, cavity), 1.0, is_coarse=True)
@@ -187,14 +186,7 @@ def _smooth_with_sites(problem: FilterProblem, updater: Updater, initial: Moment
     """Return a forward and an adjoint scan, and the smoothed predictor (T, ...)."""
     trace = forward(problem, updater, initial=initial, about=points, record=record, maps=maps)
     smoothed = backward(problem, trace, adjoint_only=True)
-    predictor = jax.tree.map(lambda a: at_intervals(a, problem.grid.observed), smoothed.predictor)
-    assert predictor is not None
-    return trace, smoothed, predictor
-
-
-def _sites_of(problem: FilterProblem, trace: FilterTrace) -> Sites:
-    """Return the sites (T, D) of a forward scan."""
-    return jax.tree.map(lambda a: at_intervals(a, problem.grid.observed), trace.update.site_terms.sites)
+    return trace, smoothed, at_intervals(smoothed.predictor, problem.grid.observed)
 
 
 def _joint_sweeps(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, initial: Moments,
@@ -209,7 +201,7 @@ def _joint_sweeps(problem: FilterProblem, terms: EntryTerms, settings: SiteSetti
         maps = maps_about(problem, points) if points is not None and needs_ends_only else None
         record = Record.LINEARIZATION if maps is None else Record.SMOOTHER
         trace, smoothed, predictor = _smooth_with_sites(problem, updater, initial, points, record, maps)
-        sites = _sites_of(problem, trace)
+        sites = at_intervals(trace.update.site_terms.sites, grid.observed)
         cavity = cavities(predictor, sites, terms.present, settings.power)
         # Points of linearisation take the derivative of these sites, and that of coarse ones is not exact enough.
         refined = new_sites(terms, sites, cavity, settings, settings.damping)[0]
@@ -238,8 +230,8 @@ def _sweep_until_converged(problem: FilterProblem, terms: EntryTerms, settings: 
         return Sweep(new, cavity, log_partition, jnp.where(is_valid(predictor, cavity), change, jnp.inf))
 
     # Points of linearisation come from sweeps of the same sites, whose changes do not grow any more.
-    growing_sweeps = FixedPointOptions().growing_sweeps if points is None else 1
-    return iterate_sites(sweep, first, settings.damping, settings.sweeps, growing_sweeps)
+    options = FixedPointOptions() if points is None else FixedPointOptions(growing_sweeps=1)
+    return iterate_sites(sweep, first, settings.damping, settings.sweeps, options)
 
 
 def _newton_step(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, initial: Moments,
@@ -262,11 +254,7 @@ def _final_sites(terms: FamilyTerms, fixed_point: FixedPoint, uses_moments: bool
 
     Over a small variance v a factor hardly differs from a constant, and moments of the tilted distribution have its
     slope to eps / sd only. The derivatives of log p at the mean are the slope and the curvature to a relative error v.
-
-    Args:
-        terms: the factors of the data.
-        fixed_point: result of the sweeps.
-        uses_moments: whether the sites come from moments, as in expectation propagation.
+    ``uses_moments``: whether the sites come from moments, as in expectation propagation.
     """
     sites, cavity = fixed_point.sites, fixed_point.cavity
     nu, tau = sites.nu, sites.tau

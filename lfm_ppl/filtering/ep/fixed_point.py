@@ -24,8 +24,6 @@ from lfm_ppl.filtering.ep.settings import FixedPointOptions
 from lfm_ppl.filtering.update import Sites
 from lfm_ppl.utils.linalg import matmul, solve_semidefinite
 
-_OPTIONS = FixedPointOptions()
-
 
 class Sweep(NamedTuple):
     """Result of one sweep.
@@ -95,8 +93,7 @@ class _State(NamedTuple):
 
 
 def iterate_sites(sweep: Callable[[Sites, jax.Array], Sweep], start: Sites, damping: float, max_sweeps: int,
-                  growing_sweeps: int = _OPTIONS.growing_sweeps,
-                  options: FixedPointOptions = _OPTIONS) -> FixedPoint:
+                  options: FixedPointOptions) -> FixedPoint:
     """Sweep until the sites do not change.
 
     Args:
@@ -104,7 +101,6 @@ def iterate_sites(sweep: Callable[[Sites, jax.Array], Sweep], start: Sites, damp
         start: first sites.
         damping: largest fraction of a move that is taken.
         max_sweeps: largest number of sweeps.
-        growing_sweeps: first sweeps, in which changes may grow.
         options: constants of the iteration.
     """
 
@@ -117,7 +113,7 @@ def iterate_sites(sweep: Callable[[Sites, jax.Array], Sweep], start: Sites, damp
         position = jnp.stack([sites.nu, sites.tau])
         move = jnp.stack([new.nu, new.tau]) - position
         is_larger, is_switch = change > state.last_change, ~is_coarse & (state.fine_sweeps == 0)
-        has_grown = is_larger & ~is_switch & (state.sweeps >= growing_sweeps)
+        has_grown = is_larger & ~is_switch & (state.sweeps >= options.growing_sweeps)
         fraction = jnp.where(has_grown, jnp.maximum(0.5 * state.fraction, 0.05),
                              jnp.minimum(1.5 * state.fraction, damping))
         fraction = jnp.where(is_valid, fraction, 0.5 * state.fraction)

@@ -26,7 +26,6 @@ from jax.scipy.special import ndtri
 
 from lfm_ppl.filtering.ep.cavities import is_deterministic, with_positive_variance
 from lfm_ppl.filtering.ep.quadrature import MeanVariance, TiltedMoments, expectation, tilted_moments
-from lfm_ppl.filtering.ep.terms import row_log_prob
 from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals
@@ -38,6 +37,7 @@ from lfm_ppl.filtering.update import (
     multiply_by_sites,
     predictor_variance,
 )
+from lfm_ppl.model.observation_noise import row_log_prob
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.utils.linalg import diagonal
 
@@ -194,7 +194,7 @@ def assumed_density_filter(problem: FilterProblem, y: jax.Array, initial: Moment
     """Filter data of a family: the site of each observation is made from its prediction, once."""
     updater = MomentMatchingUpdate(observation_family(problem), y)
     trace = forward(problem, updater, initial=initial, record=Record.MOMENTS)
-    at_data = jax.tree.map(lambda a: at_intervals(a, problem.grid.observed), trace._replace(initial=None))
+    at_data = at_intervals(trace._replace(initial=None), problem.grid.observed)
     terms = at_data.update.site_terms
     return PrequentialResult(at_data.log_likelihood, trace,
                              with_positive_variance(terms.value, diagonal(terms.variance)))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from lfm_ppl.filtering.ep.quadrature import MeanVariance, TiltedMoments, tilted_moments
+from lfm_ppl.model.observation_noise import row_log_prob
 from lfm_ppl.model.observations.family import ObservationFamily
 
 
@@ -57,10 +58,3 @@ class FamilyTerms(eqx.Module):
         # Where the rule is exact the integral does not depend on the location of its nodes. That of few nodes may, far
         # from a Gaussian product, so that no derivative is taken of coarse moments.
         return tilted_moments(lambda f: power * self.log_prob(f), cavity, jax.lax.stop_gradient(centre), is_coarse)
-
-
-def row_log_prob(family: ObservationFamily, row: Any, f: jax.Array, y: jax.Array) -> jax.Array:
-    """Return log p(y_d | f_d) (D,) of a row, zero where missing."""
-    present = jnp.isfinite(y)
-    # A missing entry must not put NaN into a derivative.
-    return jnp.where(present, family.select_row(row).log_prob(f, jnp.where(present, y, family.possible(f))), 0.0)

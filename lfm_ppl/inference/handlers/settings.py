@@ -63,16 +63,12 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
 
     def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
         """Return the likelihood with the new settings."""
-        if isinstance(likelihood, Panel):
-            settings = self._merged(likelihood.settings)
-            return Panel(likelihood.build, likelihood.parameters, likelihood.times, settings)
         if isinstance(likelihood, Switching):
             return likelihood.with_settings(**self.settings)
-        settings = self._merged(likelihood.settings)
+        has_equal_steps = "steps" in self.settings or self.settings.get("iterations", 0) > 0
+        is_single_pass = any(self.settings.get(name) for name in ("tolerance", "lower", "upper", "constraints"))
+        settings = likelihood.settings | ({"tolerance": None} if has_equal_steps else {})
+        settings |= ({"iterations": 0} if is_single_pass else {}) | self.settings
+        if isinstance(likelihood, Panel):
+            return Panel(likelihood.build, likelihood.parameters, likelihood.times, settings)
         return MarginalLikelihood(likelihood.model, likelihood.times, **settings)
-
-    def _merged(self, previous: dict[str, Any]) -> dict[str, Any]:
-        equal = "steps" in self.settings or self.settings.get("iterations", 0) > 0
-        single = any(self.settings.get(name) for name in ("tolerance", "lower", "upper", "constraints"))
-        return {**previous, **({"tolerance": None} if equal else {}), **({"iterations": 0} if single else {}),
-                **self.settings}

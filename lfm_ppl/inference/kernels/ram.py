@@ -2,8 +2,6 @@
 
 1. `RAM` holds the options, and adapts the algorithm of `robust_metropolis` to NumPyro's kernel interface.
 2. The first proposal covariance is a multiple of the identity, or given, for example from `lfm_ppl.map_estimate`.
-
-Source: Vihola (2012), Statistics and Computing 22.
 """
 
 from __future__ import annotations
@@ -16,14 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
-from numpyro.infer import init_to_median
+from numpyro import handlers
+from numpyro.infer import init_to_median, init_to_uniform
 from numpyro.infer.util import ParamInfo, initialize_model
 from numpyro.util import identity, is_prng_key
 
 from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
 from lfm_ppl.inference.kernels.kernel import Kernel, as_floating_point, check_start, map_chains
-from lfm_ppl.inference.kernels.robust_metropolis import RAMState, finite_or_infinity, robust_metropolis
-from lfm_ppl.inference.unconstrained import check_latent_sites
+from lfm_ppl.inference.kernels.robust_metropolis import Adaptation, RAMState, finite_or_infinity, robust_metropolis
+from lfm_ppl.inference.unconstrained import check_latent, latent_sites
 from lfm_ppl.utils import checks
 
 _ADAPTATIONS = ("warmup", "throughout")
@@ -113,19 +112,12 @@ class RAM(Kernel):
             checks.positive("initial_scale", initial_scale)
         super().__init__(model)
         self._potential_fn = potential_fn
-        self._target_accept_prob = target_accept_prob
+        self.adaptation = Adaptation(target_accept_prob, exponent, adapt == "throughout")
         self._initial_scale = initial_scale
         self._initial_chol = None if initial_covariance is None else _cholesky(initial_covariance)
-        self._adapt_throughout = adapt == "throughout"
-        self._exponent = exponent
         self._init_strategy = init_strategy
         self._potential_fn_gen: Callable | None = None
         self._postprocess_fn: Callable | None = None
-
-    @property
-    def adaptation(self) -> tuple[float | None, float, bool]:
-        """Target acceptance probability, exponent, and whether the adaptation continues after the warm-up."""
-        return self._target_accept_prob, self._exponent, self._adapt_throughout
 
     def get_diagnostics_str(self, state: RAMState) -> str:
         """Return the step size and the mean acceptance probability, for the progress bar."""
@@ -161,7 +153,9 @@ class RAM(Kernel):
                            kwargs: dict) -> tuple[Any, jax.Array]:
         if self._model is not None:
             first_key = key if is_prng_key(key) else key[0]
-            check_latent_sites(self._model, args, kwargs, first_key, "RAM")
+            # init_to_uniform also serves improper priors, from which nothing can be drawn.
+            seeded = handlers.substitute(handlers.seed(self._model, first_key), substitute_fn=init_to_uniform)
+            check_latent(latent_sites(handlers.trace(seeded).get_trace(*args, **kwargs)), "RAM")
             info, self._potential_fn_gen, self._postprocess_fn, _ = initialize_model(
                 key,
                 self._model,

@@ -52,16 +52,27 @@ class RAMState(NamedTuple):
     rng_key: jax.Array
 
 
-def robust_metropolis(
-    potential_at: Callable[[Any], Callable[[Any], jax.Array]],
-    adaptation: tuple[float | None, float, bool],
-    num_warmup: int,
-) -> SamplingAlgorithm:
+class Adaptation(NamedTuple):
+    """How the proposal adapts.
+
+    Attributes:
+        target_accept_prob: ``alpha*``; None for 0.44 in one dimension and 0.234 otherwise.
+        exponent: ``gamma`` of the adaptation steps ``min(1, d n^-gamma)``.
+        throughout: adapt after the warm-up as well.
+    """
+
+    target_accept_prob: float | None
+    exponent: float
+    throughout: bool
+
+
+def robust_metropolis(potential_at: Callable[[Any], Callable[[Any], jax.Array]], adaptation: Adaptation,
+                      num_warmup: int) -> SamplingAlgorithm:
     """Return robust adaptive Metropolis; its tuning is the first proposal factor (d, d).
 
     Args:
-        potential_at: from the data to minus the log density, a function of the position.
-        adaptation: ``(alpha*, gamma, throughout)``, see `robust_metropolis_step`.
+        potential_at: from the data to minus the log density, a function of the position. NaN or an infinity rejects.
+        adaptation: of the proposal.
         num_warmup: number of steps that adapt the proposal.
     """
 
@@ -69,7 +80,14 @@ def robust_metropolis(
         return initial_state(point.z, point.potential_energy, key, factor, num_warmup)
 
     def step(state: RAMState, data: Any) -> RAMState:
-        return robust_metropolis_step(potential_at(data), *adaptation, state)
+        rng_key, key_noise, key_accept = jax.random.split(state.rng_key, 3)
+        proposal, noise = propose(state, key_noise)
+        energy = finite_or_infinity(potential_at(data)(proposal))
+        accept_prob = acceptance(state.potential_energy - energy)
+        accepted = jax.random.uniform(key_accept, (), noise.dtype) < accept_prob
+        new_state = state._replace(z=choose(accepted, proposal, state.z), accepted=accepted, rng_key=rng_key,
+                                   potential_energy=jnp.where(accepted, energy, state.potential_energy))
+        return adapt_proposal(new_state, noise, accept_prob, adaptation)
 
     return SamplingAlgorithm(init, step, summary)
 
@@ -101,39 +119,6 @@ def initial_state(
     )
 
 
-def robust_metropolis_step(
-    potential: Callable[[Any], jax.Array],
-    target_accept_prob: float | None,
-    exponent: float,
-    throughout: bool,
-    state: RAMState,
-) -> RAMState:
-    """Propose, accept or reject, and adapt.
-
-    Args:
-        potential: minus the log density, a function of ``state.z``. NaN or an infinity rejects.
-        target_accept_prob: ``alpha*``; None for 0.44 in one dimension and 0.234 otherwise.
-        exponent: ``gamma`` of the adaptation steps ``min(1, d n^-gamma)``.
-        throughout: adapt after the warm-up as well.
-        state: the state ``n - 1``.
-
-    Returns:
-        The state ``n``.
-    """
-    rng_key, key_noise, key_accept = jax.random.split(state.rng_key, 3)
-    proposal, noise = propose(state, key_noise)
-    energy = finite_or_infinity(potential(proposal))
-    accept_prob = acceptance(state.potential_energy - energy)
-    accepted = jax.random.uniform(key_accept, (), noise.dtype) < accept_prob
-    new_state = state._replace(
-        z=choose(accepted, proposal, state.z),
-        potential_energy=jnp.where(accepted, energy, state.potential_energy),
-        accepted=accepted,
-        rng_key=rng_key,
-    )
-    return adapt_proposal(new_state, noise, accept_prob, target_accept_prob, exponent, throughout)
-
-
 def propose(state: RAMState, key: jax.Array) -> tuple[Any, jax.Array]:
     """Return a proposal ``x + S U``, shaped like ``state.z``, and the draw ``U`` (d,)."""
     flat, unravel = ravel_pytree(state.z)
@@ -157,30 +142,21 @@ def choose(accepted: jax.Array, proposal: Any, present: Any) -> Any:
     return jax.tree_util.tree_map(partial(jnp.where, accepted), proposal, present)
 
 
-def adapt_proposal(
-    state: RAMState,
-    noise: jax.Array,
-    accept_prob: jax.Array,
-    target_accept_prob: float | None,
-    exponent: float,
-    throughout: bool,
-) -> RAMState:
+def adapt_proposal(state: RAMState, noise: jax.Array, accept_prob: jax.Array, adaptation: Adaptation) -> RAMState:
     """Count a step and adapt the proposal.
 
     Args:
         state: the state after the step in position and energy, and before it in the other fields.
         noise: the draw ``U`` (d,) of the proposal.
         accept_prob: ``alpha_n``.
-        target_accept_prob: ``alpha*``; None for 0.44 in one dimension and 0.234 otherwise.
-        exponent: ``gamma`` of the adaptation steps ``min(1, d n^-gamma)``.
-        throughout: adapt after the warm-up as well.
+        adaptation: of the proposal.
     """
     accept_prob = accept_prob.astype(noise.dtype)
     i = state.i + 1
     warming_up = i <= state.num_warmup
-    eta = jnp.minimum(1.0, noise.size * i.astype(noise.dtype) ** -exponent)
-    eta = jnp.where(warming_up | throughout, eta, 0.0)
-    target = target_accept_prob or (0.44 if noise.size == 1 else 0.234)
+    eta = jnp.minimum(1.0, noise.size * i.astype(noise.dtype) ** -adaptation.exponent)
+    eta = jnp.where(warming_up | adaptation.throughout, eta, 0.0)
+    target = adaptation.target_accept_prob or (0.44 if noise.size == 1 else 0.234)
     chol = adapt(state.chol_proposal, noise, eta * (accept_prob - target))
     in_phase = jnp.where(warming_up, i, i - state.num_warmup)
     return state._replace(
@@ -209,9 +185,7 @@ def adapt(chol: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Array:
     Returns:
         Factor ``S_{n+1}`` of shape (d, d).
 
-    Source:
-        Vihola (2012), Robust adaptive Metropolis algorithm with coerced acceptance rate, Statistics
-        and Computing 22, 997-1008, equation (1).
+    Source: Vihola (2012), equation (1).
     """
     tiny = jnp.finfo(chol.dtype).tiny
     direction = noise / jnp.sqrt(jnp.maximum(jnp.sum(noise**2), tiny))

@@ -196,9 +196,9 @@ class ObservationFamily(eqx.Module):
                              f"missing entry.{order}")
 
 
-def as_parameter(name: str, value: Any, positive: bool = True) -> jax.Array:
-    """Return a parameter of a family as an array; raise ValueError if it is not finite (and positive)."""
-    (checks.positive if positive else checks.finite)(name, value)
+def as_parameter(name: str, value: Any) -> jax.Array:
+    """Return a parameter of a family as an array; raise ValueError if it is not finite and positive."""
+    checks.positive(name, value)
     return jnp.asarray(value, float)
 
 
