@@ -10,9 +10,8 @@ Source: Talts et al. (2018), arXiv:1804.06788; Modrak et al. (2023), Bayesian An
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from scipy import stats
 
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.likelihood_site import likelihood_site
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.parallel.cluster import Workers
 from lfm_ppl.parallel.run import run_tasks
 from lfm_ppl.parallel.task import Task
@@ -115,7 +113,7 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
     if method is not None:
         checks.one_of("method", method, METHODS)
     compute = _Ranks(model, np.asarray(times, float), kernel, draws, thin, warmup, batch, method)
-    compute.check()
+    likelihood_site(model, (compute.times,), {}, jax.random.key(0))  # raises an error before anything is computed
     truth_keys, chain_keys = (np.asarray(jax.random.key_data(jax.random.split(subkey, data_sets)))
                               for subkey in jax.random.split(key))
     settings = {"key": np.asarray(jax.random.key_data(key)).ravel().tolist(), "times": compute.times.tolist(),
@@ -128,7 +126,7 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
     return Calibration({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, draws)
 
 
-@dataclasses.dataclass(eq=False)
+@dataclass(eq=False)
 class _Ranks:
     """From a task, the keys of some data sets, to the ranks of the true values in them."""
 
@@ -140,10 +138,6 @@ class _Ranks:
     warmup: int
     batch: int
     method: str | None = None
-
-    def check(self) -> None:
-        """Raise where the model has no likelihood site, before anything is computed."""
-        likelihood_site(self.model, (self.times,), {}, jax.random.key(0))
 
     @functools.cached_property
     def program(self) -> Callable:
@@ -165,19 +159,19 @@ class _Ranks:
             posterior[LOG_LIKELIHOOD] = jax.lax.map(score, posterior)
             return {n: (posterior[n] < truth[n]).sum(0) for n in truth}
 
+        # By default sequentially if sites take different numbers of iterations.
+        method = self.method or ("sequential" if site.example.has_sites else "vectorized")
         # jax.lax.map with a batch size would evaluate both branches of each condition.
-        side_by_side = self.batch > 1 and self._method(site.example) == "vectorized"
-        return jax.jit(lambda keys: jax.lax.map(rank_statistics, keys, batch_size=self.batch if side_by_side else None))
-
-    def _method(self, likelihood: SeriesLikelihood) -> str:
-        """Return how the data sets of a task run: sequentially if sites take different numbers of iterations."""
-        return self.method or ("sequential" if likelihood.has_sites else "vectorized")
+        batch_size = self.batch if self.batch > 1 and method == "vectorized" else None
+        return jax.jit(lambda keys: jax.lax.map(rank_statistics, keys, batch_size=batch_size))
 
     def __call__(self, task: Task) -> dict[str, np.ndarray]:
         """Return name of a scalar -> ranks."""
         *keys, kind = task.data
-        results = self.program(tuple(jax.random.wrap_key_data(jnp.asarray(key_data), impl=kind) for key_data in keys))
-        return _scalars({name: np.asarray(value) for name, value in results.items()})
+        keys = tuple(jax.random.wrap_key_data(jnp.asarray(key_data), impl=kind) for key_data in keys)
+        ranks = jax.device_get(self.program(keys))
+        return {f"{name}[{','.join(map(str, index))}]" if index else name: value[:, *index]
+                for name, value in ranks.items() for index in np.ndindex(value.shape[1:])}
 
 
 def _name(function: Callable) -> str:
@@ -194,14 +188,6 @@ def _chain(kernel: Any, arguments: tuple, key: jax.Array, draws: int, thin: int,
 
     _, collected = jax.lax.scan(step, kernel.init(key, warmup, None, arguments, {}), counts)
     return jax.vmap(kernel.postprocess_fn(arguments, {}))(collected)
-
-
-def _scalars(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    flat = {}
-    for name, value in values.items():
-        for index in np.ndindex(value.shape[1:]):
-            flat[f"{name}[{','.join(map(str, index))}]" if index else name] = value[(slice(None), *index)]
-    return flat
 
 
 def p_values(rank: np.ndarray, draws: int, bins: int = 16) -> dict[str, float]:
