@@ -135,15 +135,15 @@ def summary(dataset: xr.Dataset) -> pd.DataFrame:
         Indexed by time; columns output, mean, sd, q2.5, q97.5, noise_free_mean, noise_free_q2.5, noise_free_q97.5.
     """
     rows = []
-    new = _flat(observed_variable(dataset))
+    new = flat_draws(observed_variable(dataset))
     if MEAN in dataset and SD in dataset:
-        mean = _flat(dataset[MEAN])
-        spread = np.sqrt(np.mean(_flat(dataset[SD]) ** 2, axis=0) + mean.var(axis=0))
+        mean = flat_draws(dataset[MEAN])
+        spread = np.sqrt(np.mean(flat_draws(dataset[SD]) ** 2, axis=0) + mean.var(axis=0))
     else:
         mean, spread = new, new.std(axis=0)
     low, high = interval(dataset)
     below, above = noise_free_interval(dataset)
-    free = mean.mean(axis=0) if MEAN in dataset else _flat(dataset["outputs"]).mean(axis=0)
+    free = mean.mean(axis=0) if MEAN in dataset else flat_draws(dataset["outputs"]).mean(axis=0)
     for k, time in enumerate(dataset["time"].values):
         for d, name in enumerate(dataset["output"].values):
             rows.append({"time": time, "output": str(name), "mean": mean[:, k, d].mean(), "sd": spread[k, d],
@@ -155,8 +155,8 @@ def summary(dataset: xr.Dataset) -> pd.DataFrame:
 def interval(dataset: xr.Dataset) -> np.ndarray:
     """Return the ends (2, K, D) of the 95% interval of new data, by their density where it is known."""
     if MEAN in dataset and SD in dataset:
-        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[SD]), INTERVAL)
-    return quantiles(_flat(observed_variable(dataset)), INTERVAL)
+        return mixture_quantiles(flat_draws(dataset[MEAN]), flat_draws(dataset[SD]), INTERVAL)
+    return quantiles(flat_draws(observed_variable(dataset)), INTERVAL)
 
 
 def quantiles(draws: np.ndarray, p: Any) -> np.ndarray:
@@ -177,8 +177,8 @@ def quantiles(draws: np.ndarray, p: Any) -> np.ndarray:
 def noise_free_interval(dataset: xr.Dataset) -> np.ndarray:
     """Return the ends (2, K, D) of the 95% interval of the noise-free outputs, by their density where it is known."""
     if MEAN in dataset and FREE_SD in dataset and bool((dataset[FREE_SD] > 0).any()):
-        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[FREE_SD]), INTERVAL)
-    return np.quantile(_flat(dataset["outputs"]), INTERVAL, axis=0)
+        return mixture_quantiles(flat_draws(dataset[MEAN]), flat_draws(dataset[FREE_SD]), INTERVAL)
+    return np.quantile(flat_draws(dataset["outputs"]), INTERVAL, axis=0)
 
 
 def repeats_often(period: float, span: float) -> bool:
@@ -186,8 +186,9 @@ def repeats_often(period: float, span: float) -> bool:
     return span > 2 * SHOWN_PERIODS * period
 
 
-def _flat(variable: xr.DataArray) -> np.ndarray:
-    variable = variable.transpose("chain", "draw", "time", "output")
+def flat_draws(variable: xr.DataArray) -> np.ndarray:
+    """Return the draws (S, ..., K, D) of all chains, one chain after another."""
+    variable = variable.transpose("chain", "draw", ..., "time", "output")
     return np.asarray(variable.values, float).reshape(-1, *variable.shape[2:])
 
 

@@ -24,7 +24,7 @@ from lfm_ppl.io.data import as_data
 from lfm_ppl.io.data_set import model_keywords
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
-from lfm_ppl.results.predictions import GROUP, MEAN, SD, observed_variable
+from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable
 from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.types import Times
@@ -183,9 +183,9 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
                 predicted = arviz_data.group(result, GROUP).isel(time=future)
             except Exception as error:
                 raise type(error)(f"at the origin {times[origin]:g} (row {origin}): {error}") from error
-            draws_of_y = _flat(observed_variable(predicted))
+            draws_of_y = flat_draws(observed_variable(predicted))
             # An observation family has no normal distribution at each draw.
-            mean, sd = (_flat(predicted[name]) if name in predicted else None for name in (MEAN, SD))
+            mean, sd = (flat_draws(predicted[name]) if name in predicted else None for name in (MEAN, SD))
             densities = None if mean is not None else _of_family(bound, result, predicted, y[future])
             origin_scores = scores(draws_of_y, y[future], mean, sd, level, angular, densities)
         messages += [f"origin {times[origin]:g}: {warning.message}" for warning in caught]
@@ -246,11 +246,6 @@ def _naive(y: np.ndarray, horizon: int, season: int, angular: np.ndarray) -> tup
 def _wrapped(angle: np.ndarray) -> np.ndarray:
     """Return differences of angles on the circle; in NumPy, since each shape would be compiled otherwise."""
     return np.angle(np.exp(1j * angle))
-
-
-def _flat(variable: xr.DataArray) -> np.ndarray:
-    variable = variable.transpose("chain", "draw", "time", "output")
-    return np.asarray(variable.values, float).reshape(-1, *variable.shape[2:])
 
 
 def _dataset(forecasters: tuple, reference: str, times: np.ndarray, origins: list[int], horizon: int,
