@@ -28,7 +28,7 @@ from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding, run_record
 from lfm_ppl.results import checkpoint as checkpoints
-from lfm_ppl.results.approximation import more_iterations
+from lfm_ppl.results.approximation import finite_sd, more_iterations
 from lfm_ppl.results.likelihoods import LikelihoodProblem, Reference, ReferenceSettings
 from lfm_ppl.results.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.results.scalars import choose, scalar_draws
@@ -150,16 +150,17 @@ def _report(result: Any, problem: LikelihoodProblem, draw_index: np.ndarray,
         site_result = select_site(result, name) if arviz_data.sites_of(result) else result
         recorded = likelihoods.recorded(site, filtered[name].ravel()).reshape(shape)
         rebuilding.check_likelihood(site_result, recorded, draw_index)
-    doubled = [likelihoods.gaussian_with_finer_steps(site).reshape(shape) for site in sites.values()]
+    doubled = [likelihoods.gaussian(site, "log likelihoods with finer steps", **likelihoods.finer_steps(site.example))
+               for site in sites.values()]
     iterated, refinements = dict(filtered), {name: more_iterations(site.example) for name, site in sites.items()}
     for name, refinement in refinements.items():
         if refinement is not None:
-            refined = replace(sites[name], bound=sites[name].bound.approximate(**refinement.settings))
-            iterated[name] = likelihoods.gaussian(refined, "log likelihoods with more iterations").reshape(shape)
+            iterated[name] = likelihoods.gaussian(sites[name], "log likelihoods with more iterations",
+                                                  **refinement.settings).reshape(shape)
     references = {name: _reference(site, filtered[name], settings[name], len(sites)) for name, site in sites.items()}
-    return assess(result, draw_index, np.sum([*filtered.values()], axis=0), np.sum(doubled, axis=0),
-                  _of_all_sites(references), problem,
-                  np.sum([*iterated.values()], axis=0) if any(refinements.values()) else None)
+    return _assess(result, draw_index, np.sum([*filtered.values()], axis=0), np.sum(doubled, axis=0).reshape(shape),
+                   _of_all_sites(references), problem,
+                   np.sum([*iterated.values()], axis=0) if any(refinements.values()) else None)
 
 
 def _of_all_sites(references: Mapping[str, Reference]) -> Reference:
@@ -175,18 +176,11 @@ def _of_all_sites(references: Mapping[str, Reference]) -> Reference:
         max(reference.particles for reference in values), any(reference.limited for reference in values))
 
 
-def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
-           problem: LikelihoodProblem, iterated: np.ndarray | None = None) -> AccuracyReport:
-    """Return the report from log likelihoods at draws.
+def _assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
+            problem: LikelihoodProblem, iterated: np.ndarray | None) -> AccuracyReport:
+    """Return the report from log likelihoods (C, S) at draws ``draw_index`` (S,) of each chain.
 
-    Args:
-        result: with the posterior.
-        draw_index: (S,), draws of each chain.
-        filtered: (C, S), log likelihoods of the Gaussian filter.
-        doubled: (C, S), with twice as many steps.
-        reference: log likelihoods of the reference.
-        problem: model and data.
-        iterated: (C, S), with more iterations of posterior linearisation; None where there are none to add.
+    They are those of the Gaussian filter, also with twice as many steps and with more iterations (None: no more).
     """
     posterior = arviz_data.group(result, "posterior")
     averaged = _summed(reference.estimates.reshape(*filtered.shape, *reference.estimates.shape[1:]))
@@ -208,9 +202,8 @@ def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: n
         sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.steps, max_step=example.max_step,
         tolerance=example.tolerance)
     if iterated is not None and (refinement := more_iterations(example)) is not None:
-        findings = replace(findings, 
-            iterations=refinement.settings["iterations"], ratio_sd=_finite_sd(ratio),
-            iterated_ratio_sd=_finite_sd(averaged.log_mean - iterated))
+        findings = replace(findings, iterations=refinement.settings["iterations"], ratio_sd=finite_sd(ratio),
+                           iterated_ratio_sd=finite_sd(averaged.log_mean - iterated))
     verdict = judge(findings)
     sample = ("chain", "draw")
     variables = {
@@ -230,11 +223,6 @@ def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: n
         "step_change_sd": findings.step_change_sd, "steps": example.steps, "available_draws": findings.available,
         "verdict": verdict.word, "reason": verdict.reason, "command": verdict.command,
         "remedies": json.dumps(verdict.remedies)}))
-
-
-def _finite_sd(values: np.ndarray) -> float:
-    """Return the standard deviation; infinite where a value is not finite."""
-    return float(values.std()) if np.isfinite(values).all() else np.inf
 
 
 def noise(averaged: importance.Averaged) -> float:

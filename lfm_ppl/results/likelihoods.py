@@ -147,9 +147,9 @@ def is_exact(ssm: StateSpaceModel) -> bool:
     return ssm.time_invariant and not is_family and not is_observation_nonlinear(ssm)
 
 
-def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods") -> np.ndarray:
-    """Return (S,): the log likelihoods of the Gaussian filter, summed over the series of a panel."""
-    bound = problem.bound
+def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods", **settings: Any) -> np.ndarray:
+    """Return log likelihoods (S,) of the Gaussian filter, with other settings, summed over the series of a panel."""
+    bound = problem.bound.approximate(**settings) if settings else problem.bound
 
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
         return {"total": bound.likelihood(values, y).log_prob(bound.data(y)).sum()}
@@ -187,12 +187,6 @@ def finer_steps(example: SeriesLikelihood) -> dict[str, Any]:
     if example.tolerance is not None:
         settings["tolerance"] = finer_tolerance(example.tolerance)
     return settings
-
-
-def gaussian_with_finer_steps(problem: LikelihoodProblem) -> np.ndarray:
-    """Return (S,): the log likelihoods of the Gaussian filter with about twice as many integration steps."""
-    finer = problem.bound.approximate(**finer_steps(problem.example))
-    return gaussian(replace(problem, bound=finer), "log likelihoods with finer steps")
 
 
 def on_grid(problem: LikelihoodProblem, settings: ReferenceSettings) -> Reference:
@@ -337,11 +331,6 @@ def _scout_models(problem: LikelihoodProblem) -> list[Any]:
     models = []
     for row in rows:
         parameters = {name: jnp.asarray(value[row]) for name, value in problem.draws.items()}
-        distribution = problem.bound.likelihood(parameters)
-        if isinstance(distribution, Panel):
-            leaves = [jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[b], distribution.parameters)  # noqa: B023
-                      for b in range(problem.series)]
-            models += [distribution.build(leaf) for leaf in leaves]
-        else:
-            models.append(distribution.model)
+        site = problem.bound.site._replace(distribution=problem.bound.likelihood(parameters))
+        models += [member.model for member in site.members]
     return models
