@@ -227,28 +227,6 @@ def load(path: str | Path) -> Any:
     return build(datasets, attrs)
 
 
-def rhat(result: Any) -> pd.Series:
-    """Return the rank-normalised split R-hat of every scalar parameter, by label.
-
-    NaN where it does not exist: one chain, fewer than four draws, a constant or non-finite chain.
-    Source: Vehtari et al. (2021), Bayesian Analysis 16(2), eq. 3 and section 4.1.
-    """
-    return _diagnostic(result, lambda draws: load_arviz().rhat(draws), min_chains=2)
-
-
-def ess(result: Any, method: str = "bulk") -> pd.Series:
-    """Return the effective sample size of every scalar parameter, by label.
-
-    Args:
-        result: an ArviZ object with a posterior.
-        method: "bulk", or "tail" for the smaller one of the 5% and 95% quantiles.
-    """
-    if method == "tail":
-        # ArviZ 1.x has another default probability than 0.23.
-        return _diagnostic(result, lambda draws: load_arviz().ess(draws, method="tail", prob=(0.05, 0.95)))
-    return _diagnostic(result, lambda draws: load_arviz().ess(draws, method=method))
-
-
 def summary(result: Any) -> pd.DataFrame:
     """Return one row per scalar parameter, the same on every version of ArviZ.
 
@@ -257,7 +235,9 @@ def summary(result: Any) -> pd.DataFrame:
 
     Returns:
         Columns mean, sd, q2.5, q97.5 (quantiles in percent), truth (where a result has it), mcse_mean, ess_bulk,
-        ess_tail, r_hat; rows labelled ``noise_sd`` or ``decay[CDKN1A]``. Resampled draws are no chains: the effective
+        ess_tail (the smaller one of the 5% and 95% quantiles), r_hat (rank-normalised split R-hat); rows labelled
+        ``noise_sd`` or ``decay[CDKN1A]``. Diagnostics are NaN where they do not exist: R-hat of one chain, and those of
+        fewer than four draws, or of draws that are constant or not finite. Resampled draws are no chains: the effective
         size is that of the importance weights, and there is no R-hat. Draws of a Laplace approximation (sampler "map")
         are independent: the columns are mode, mean, sd, q2.5, q97.5, truth, and ``warnings`` where the mode of a
         parameter is degenerate. A run that was stopped has a further column, ``partial``, with the number of draws.
@@ -270,11 +250,12 @@ def summary(result: Any) -> pd.DataFrame:
         >>> posterior = xr.Dataset({"decay": (("chain", "draw"), draws)})
         >>> list(summary(build({"posterior": posterior})).index)
         ['decay']
+
+    Source: Vehtari et al. (2021), Bayesian Analysis 16(2), eq. 3 and section 4.1.
     """
     draws = scalar_draws(group(result, "posterior"))
     with np.errstate(invalid="ignore"):  # of draws that are not finite
         quantiles = {label: np.quantile(values, (0.025, 0.975)) for label, values in draws.items()}
-    resampled = attributes(result).get("effective_draws")
     moments = {
         "mean": {label: _mean(values) for label, values in draws.items()},
         "sd": {label: _sd(values) for label, values in draws.items()},
@@ -288,18 +269,15 @@ def summary(result: Any) -> pd.DataFrame:
         if degenerate := _degenerate(result):
             table["warnings"] = ["degenerate mode" if label in degenerate else "" for label in table.index]
         return table
-    table = pd.DataFrame(
-        {
-            **moments,
-            "mcse_mean": _diagnostic(result, lambda values: load_arviz().mcse(values, method="mean")),
-            "ess_bulk": ess(result, "bulk"),
-            "ess_tail": ess(result, "tail"),
-            "r_hat": rhat(result),
-        },
-        index=list(draws),
-        dtype=float,
-    )
-    if resampled is not None:
+    diagnostics = {
+        "mcse_mean": _diagnostic(draws, load_arviz().mcse, method="mean"),
+        "ess_bulk": _diagnostic(draws, load_arviz().ess, method="bulk"),
+        # ArviZ 1.x has another default probability than 0.23.
+        "ess_tail": _diagnostic(draws, load_arviz().ess, method="tail", prob=(0.05, 0.95)),
+        "r_hat": _diagnostic(draws, load_arviz().rhat, min_chains=2),
+    }
+    table = pd.DataFrame({**moments, **diagnostics}, index=list(draws), dtype=float)
+    if (resampled := attributes(result).get("effective_draws")) is not None:
         table["mcse_mean"] = table["sd"] / np.sqrt(resampled)
         table["ess_bulk"] = float(resampled)
         table[["ess_tail", "r_hat"]] = np.nan
@@ -412,15 +390,11 @@ def _degenerate(result: Any) -> list[str]:
     return [labels[name][index] for name, indices in variables.items() if name in labels for index in indices]
 
 
-def _diagnostic(result: Any, measure: Callable[[np.ndarray], Any], min_chains: int = 1) -> pd.Series:
-    """Apply ``measure`` to the (chain, draw) array of every scalar where it is defined."""
-    values = {}
-    for label, draws in scalar_draws(group(result, "posterior")).items():
-        defined = (
-            draws.shape[0] >= min_chains and draws.shape[1] >= 4 and np.all(np.isfinite(draws)) and np.ptp(draws) > 0.0
-        )
-        values[label] = float(measure(draws)) if defined else np.nan
-    return pd.Series(values, dtype=float)
+def _diagnostic(draws: Mapping[str, np.ndarray], measure: Callable, min_chains: int = 1,
+                **options: Any) -> dict[str, float]:
+    """Return ``measure`` of the draws (chain, draw) of every scalar; NaN where it is not defined."""
+    return {label: float(measure(values, **options)) if values.shape[0] >= min_chains and values.shape[1] >= 4
+            and np.isfinite(values).all() and np.ptp(values) > 0.0 else np.nan for label, values in draws.items()}
 
 
 def _mean(values: np.ndarray) -> float:

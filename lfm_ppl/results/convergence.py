@@ -64,8 +64,15 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
             "not reached the same distribution. Run longer (warmup, samples); if it stays, look "
             "at the trace plot for several modes and for parameters that the data do not identify."
         )
-    for column, part in (("ess_bulk", "centre"), ("ess_tail", "tails")):
-        warnings_found += _low_ess(sound[column], column.removeprefix("ess_"), part, chains)
+    minimum = MIN_ESS_PER_CHAIN * chains
+    for kind, part in (("bulk", "centre"), ("tail", "tails")):
+        low = sound[f"ess_{kind}"][sound[f"ess_{kind}"] < minimum].sort_values()
+        if len(low):
+            warnings_found.append(
+                f"{kind} effective sample size is below {minimum} ({MIN_ESS_PER_CHAIN} per chain) for "
+                f"{join_names(_with_values(low, '.0f'))}: too little is known of the {part} of the posterior. Raise "
+                f"samples (or thin) about {math.ceil(minimum / max(low.iloc[0], 1.0))}-fold, or lower the correlation "
+                "between parameters.")
     if divergences:
         share = 100.0 * divergences / (chains * draws)
         warnings_found.append(
@@ -151,19 +158,6 @@ def log_mean_error(worth: float, count: int) -> float:
         count: N; with fewer than two nothing is known.
     """
     return math.sqrt(max(count / worth - 1.0, 0.0) / (count - 1)) if count > 1 else math.nan
-
-
-def _low_ess(ess: pd.Series, kind: str, part: str, chains: int) -> list[str]:
-    minimum = MIN_ESS_PER_CHAIN * chains
-    low = ess[ess < minimum].sort_values()
-    if not len(low):
-        return []
-    factor = math.ceil(minimum / max(low.iloc[0], 1.0))
-    return [
-        f"{kind} effective sample size is below {minimum} ({MIN_ESS_PER_CHAIN} per chain) for "
-        f"{join_names(_with_values(low, '.0f'))}: too little is known of the {part} of the posterior. "
-        f"Raise samples (or thin) about {factor}-fold, or lower the correlation between parameters."
-    ]
 
 
 def _with_values(values: pd.Series, form: str) -> list[str]:
