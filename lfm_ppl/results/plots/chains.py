@@ -75,8 +75,7 @@ def plot_trace(result: Any, parameters: Sequence[str] | None = None, *, width: s
     if diverging.any():
         handles.append(Line2D([], [], ls="", label="divergent", **_DIVERGENT))
     style.legend_above(figure, handles)
-    if note:
-        style.note_below(figure, note)
+    style.note_below(figure, note)
     return figure
 
 

@@ -83,8 +83,7 @@ def plot_pairs(result: Any, parameters: Sequence[str] | None = None, *, width: s
         _write_above(grid[index, index], f"{label} ({unit})" if unit else label, float(2 * index >= count))
     if diverging.any() or any(label in truth for label in labels):
         style.legend_above(figure)
-    if note:
-        style.note_below(figure, note)
+    style.note_below(figure, note)
     return figure
 
 

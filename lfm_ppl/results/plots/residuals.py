@@ -70,7 +70,7 @@ def plot_residuals(result: Any, outputs: Sequence[str] | None = None, *, series:
     residual = group(result, "one_step_ahead")["residual"]
     names, note = style.first_of(pick(residual, "output", outputs), outputs, MAX_OUTPUTS, "outputs")
     views, remark = series_views(result, series, len(names))
-    note = f"{remark} {note}".strip()
+    note = f"{remark} {note}"
     if len(views) > 1:
         return _draw_series(views, names, note, width)
     ((title, result),) = views.items()
@@ -88,8 +88,7 @@ def plot_residuals(result: Any, outputs: Sequence[str] | None = None, *, series:
         row[1].set_xlabel("normal quantile")
         row[2].set_xlabel("lag (observations)")
     style.legend_above(figure)
-    if note:
-        style.note_below(figure, note)
+    style.note_below(figure, note)
     return figure
 
 

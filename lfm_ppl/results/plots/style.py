@@ -317,9 +317,9 @@ def legend_above(figure: Figure, handles: Sequence[Any] = ()) -> None:
 
 
 def note_below(figure: Figure, text: str) -> None:
-    """Write a remark under ``figure``."""
-    lines = textwrap.wrap(text, int(figure.get_figwidth() * 17))
-    figure.supxlabel("\n".join(lines), fontsize=SMALL, color=GREY)
+    """Write a remark under ``figure``, if there is one."""
+    if lines := textwrap.wrap(text, int(figure.get_figwidth() * 17)):
+        figure.supxlabel("\n".join(lines), fontsize=SMALL, color=GREY)
 
 
 def with_unit(name: str, unit: str, room: int = _ROOM) -> str:
