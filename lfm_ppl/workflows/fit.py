@@ -64,6 +64,7 @@ from lfm_ppl.workflows.fit_options import (
     model_docstring,
 )
 from lfm_ppl.workflows.fit_results import (
+    ConvergenceWarning,
     FitProblem,
     PosteriorDraws,
     PostProcessing,
@@ -72,7 +73,6 @@ from lfm_ppl.workflows.fit_results import (
     build_result,
     note_warnings,
     post_process,
-    warn_of_convergence,
     write_result,
 )
 from lfm_ppl.workflows.fit_starts import FALLBACK, check_init, find_start
@@ -303,7 +303,8 @@ def fit(
         warnings.warn(f"the run was stopped, and its result is partial: {partial}.", stacklevel=2)
     for message in processed.warnings:
         checks.warn(message, ApproximationWarning)
-    warn_of_convergence(convergence_warnings)
+    for message in convergence_warnings:
+        checks.warn(message, ConvergenceWarning)
     return result
 
 
