@@ -21,14 +21,7 @@ def command_line(line: Sequence[str], *more: str) -> str:
 
 def update(result: Any, folder: Path, figures: Sequence[Path] = (),
            more: Mapping[str, pd.DataFrame] | None = None) -> int:
-    """Write the report of an extended result; return 1 if that fails.
-
-    Args:
-        result: an ArviZ object.
-        folder: folder of the result and its figures.
-        figures: further figures.
-        more: further tables, see `lfm_ppl.save_report`.
-    """
+    """Write the report of an extended result beside it, with further figures and tables; return 1 if that fails."""
     def write() -> Path:
         from lfm_ppl.results.plots.saving import pages_of
 

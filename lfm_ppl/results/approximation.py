@@ -114,12 +114,7 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
 
 
 def resolution_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray]) -> list[str]:
-    """Return messages on steps and forces that are too coarse at the posterior medians of the parameters.
-
-    Args:
-        bound: the model and its data.
-        draws: site name -> (S, ...), posterior draws.
-    """
+    """Return messages on steps and forces that are too coarse at the posterior medians of the parameters."""
     likelihood = bound.likelihood({name: np.median(values, axis=0) for name, values in draws.items()})
     y = np.asarray(bound.y)
     if isinstance(likelihood, Panel):

@@ -64,12 +64,7 @@ class Checkpoint:
 
     @classmethod
     def begin(cls, folder: str | Path, record: Mapping[str, Any]) -> Checkpoint:
-        """Begin a run, and remove an earlier one.
-
-        Args:
-            folder: folder of the result, made if necessary.
-            record: record of the run.
-        """
+        """Begin a run in the folder of its result, and remove an earlier one."""
         checkpoint = cls(Path(folder))
         checkpoint._store.lock()
         checkpoint._store.clear()

@@ -4,7 +4,7 @@
 2. Divergences, unconverged sites and few weighted trajectories give further messages.
 3. Each message names the number, its threshold and the remedy.
 
-Source: Vehtari et al. (2021), Bayesian Analysis 16.
+Source: Vehtari et al. (2021), Bayesian Analysis 16(2), for the thresholds.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     Returns:
         Messages that name parameters, values and a remedy; empty where nothing is wrong.
         Rows that do not vary (fixed or derived from fixed values) are passed over.
-        Source of the thresholds: Vehtari et al. (2021), Bayesian Analysis 16(2).
     """
     varying = summary[summary["sd"] != 0.0]
     broken = varying.index[~np.isfinite(varying["mean"])]

@@ -144,7 +144,7 @@ class TrajectoryDraws(NamedTuple):
 
 
 def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, trajectories: TrajectoryDraws,
-            truth: Mapping[str, Any] | None, labels: Labels | None = None) -> dict[str, xr.Dataset]:
+            truth: Mapping[str, Any] | None, labels: Labels) -> dict[str, xr.Dataset]:
     """Return the groups of a result.
 
     Args:
@@ -154,9 +154,8 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
         scores: `lfm_ppl.inference.posterior.scores` of all draws, one chain after another; None: no scores.
         trajectories: trajectories at some of the draws.
         truth: truth of simulated data.
-        labels: names of axes; None: the names of the model.
+        labels: names of axes.
     """
-    labels = labels or Labels.of(bound)
     draw_index, paths, grid = trajectories
     site, times, y = bound.site, bound.times, np.asarray(bound.y)
     chains, samples = next(iter(draws.values())).shape[:2]
