@@ -16,7 +16,6 @@ import pandas as pd
 import xarray as xr
 from scipy import special
 
-from lfm_ppl.results import arviz_data
 from lfm_ppl.results.scalars import units_attribute
 from lfm_ppl.results.series import time_coordinate
 
@@ -91,7 +90,9 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], draw_index: 
     clock = time_coordinate("time", times, panel, units)
     coords = {"chain": np.arange(paths["prediction"].shape[0]), "draw": draw_index, **clock}
     coords |= {name: labels[name] for name in panel if name in labels}
-    attrs = {"observed": site.name, "last_observation": float(last_observation(bound.times, np.asarray(bound.y)))}
+    is_observed = np.isfinite(np.asarray(bound.y)).any(axis=-1)
+    observed_times = np.broadcast_to(bound.times, is_observed.shape)[is_observed]
+    attrs = {"observed": site.name, "last_observation": float(np.max(observed_times, initial=-np.inf))}
     return xr.Dataset(variables, {**coords, **{kind: names for kind, names in named.items() if names}}, attrs)
 
 
@@ -101,12 +102,6 @@ def held_out_data(times: np.ndarray, y: np.ndarray, observed: xr.Dataset) -> xr.
     return xr.Dataset({"y": (("time", "output"), y, observed["y"].attrs)}, named)
 
 
-def last_observation(times: np.ndarray, y: np.ndarray) -> float:
-    """Return the time of the last observation that is not missing."""
-    seen = np.isfinite(y).any(axis=-1)
-    return float(np.max(np.broadcast_to(times, seen.shape)[seen], initial=-np.inf))
-
-
 def observed_variable(dataset: xr.Dataset) -> xr.DataArray:
     """Return the new observations of a dataset of predictions."""
     name = dataset.attrs.get("observed", "y")
@@ -114,15 +109,6 @@ def observed_variable(dataset: xr.Dataset) -> xr.DataArray:
         raise ValueError(f"the group {GROUP} has no variable {name!r}; it has "
                          f"{', '.join(map(str, dataset.data_vars))}. Expected what lfm.forecast made.")
     return dataset[name]
-
-
-def of_result(result: Any) -> xr.Dataset:
-    """Return the predictions of a result, or the dataset itself where it is one.
-
-    Raises:
-        ValueError: the result has none; the message says how to get them.
-    """
-    return result if isinstance(result, xr.Dataset) else arviz_data.group(result, GROUP)
 
 
 def summary(dataset: xr.Dataset) -> pd.DataFrame:

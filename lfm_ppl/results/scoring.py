@@ -3,8 +3,6 @@
 1. Align predictions and measurements in time; dates are counted as in the result.
 2. A prediction is a mixture of normal distributions over the draws, draws alone, or the law of an observation family.
 3. Compute the scores of every measurement, and their means by output.
-
-Source: Gneiting and Raftery (2007), Journal of the American Statistical Association 102.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from scipy.special import logsumexp
 from lfm_ppl.io.data_set import Data, at_origin
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import clock_of
-from lfm_ppl.results.predictions import MEAN, SD, flat_draws, observed_variable, of_result, quantiles
+from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable, quantiles
 from lfm_ppl.utils import calendar_time, checks
 
 ALL = "all"
@@ -104,7 +102,7 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
     """
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level}.")
-    predicted = of_result(result)
+    predicted = result if isinstance(result, xr.Dataset) else arviz_data.group(result, GROUP)
     variable = observed_variable(predicted)
     series = [str(dim) for dim in variable.dims if dim not in ("chain", "draw", "time", "output")]
     outputs = [str(name) for name in variable["output"].values]
