@@ -3,8 +3,6 @@
 1. Fit the model to the data up to an origin, and forecast the next rows; a second fit compiles nothing.
 2. Forecast the same rows by a reference: persistence, or the seasonal-naive forecast.
 3. Score both, move the origin on, and repeat.
-
-Source: Hyndman and Athanasopoulos (2021), Forecasting: Principles and Practice, section 5.10.
 """
 
 from __future__ import annotations
@@ -25,6 +23,7 @@ from lfm_ppl.io.data_set import model_keywords
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable
+from lfm_ppl.results.rebuilding import parameter_draws
 from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.types import Times
@@ -206,9 +205,7 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
 def _of_family(bound: BoundModel, result: Any, predicted: xr.Dataset, y: np.ndarray) -> np.ndarray:
     """Return the log densities (S, H, D) of an observation family along the predicted paths."""
     posterior = arviz_data.group(result, "posterior").isel(draw=predicted["draw"].values)
-    draws = {site: posterior[site.replace("/", ".")].transpose("chain", "draw", ...).values for site in bound.sites}
-    flat = {site: value.reshape(-1, *value.shape[2:]) for site, value in draws.items()}
-    return log_densities(bound, flat, predicted, y)
+    return log_densities(bound, parameter_draws(bound, posterior), predicted, y)
 
 
 def _origins(rows: int, horizon: int, stride: int, first: int | None) -> list[int]:
