@@ -5,12 +5,11 @@
    replicates of a particle filter.
 3. Smooth the importance weights (Pareto), and correct the moments of the parameters.
 4. `judge` turns the numbers into a verdict: trust, corrected, re-run or inconclusive.
-
-Source: Vehtari et al. (2024), JMLR 25(72); Andrieu and Roberts (2009), Annals of Statistics 37(2).
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
 from collections.abc import Callable, Mapping
@@ -131,7 +130,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
             "versions": run_record.versions(),
             "draws of the result": run_record.digest(*full_problem.draws.values()),
         }, resume)  # fmt: skip
-    with checkpoints.closing(run):
+    with contextlib.closing(run) if run else contextlib.nullcontext():
         problem = replace(full_problem.select(rows), stores=None if run is None else run.batches)
         settings = {name: ReferenceSettings(kind, particles, replicates, steps, seed, progress)
                     for name, kind in kinds.items()}

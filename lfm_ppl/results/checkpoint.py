@@ -296,13 +296,3 @@ def begin_or_resume(folder: str | Path, record: Mapping[str, Any], resume: bool)
     if resume and has_run(folder):
         return Checkpoint.resume(folder, record)
     return Checkpoint.begin(folder, record)
-
-
-@contextlib.contextmanager
-def closing(checkpoint: Checkpoint | None) -> Iterator[None]:
-    """Close a checkpoint, if there is one, at the end of the block."""
-    try:
-        yield
-    finally:
-        if checkpoint is not None:
-            checkpoint.close()

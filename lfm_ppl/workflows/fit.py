@@ -284,7 +284,7 @@ def fit(
         store = checkpoints.begin_or_resume(checkpoint, record, resume)
     if progress:
         print(f"likelihood: {description['likelihood']}", file=sys.stderr, flush=True)
-    with checkpoints.closing(store), calendar_time.in_messages(*clock):
+    with contextlib.closing(store) if store else contextlib.nullcontext(), calendar_time.in_messages(*clock):
         with _explain_start_failure(bound):
             draws = (_draw_about_mode if sampler == "map" else _sample)(problem, store, progress)
         processed = post_process(problem, draws, store, progress)
