@@ -241,8 +241,8 @@ def by_particles(problem: LikelihoodProblem, settings: ReferenceSettings, noise:
         rows = np.unique(np.linspace(0, problem.size - 1, _PILOT).round().astype(int))
         stores = problem.stores
         pilot_stores = None if stores is None else lambda name: stores(f"pilot {name}")
-        pilot = _particle_run(problem, count, settings)
-        sd = noise(pilot(replace(problem.select(rows), stores=pilot_stores), pilot_key))
+        pilot = replace(problem.select(rows), stores=pilot_stores)
+        sd = noise(_particle_estimates(pilot, count, settings, pilot_key))
         needed_particles = count * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
         time_grid = build_time_grid(example.ssm, example.times, settings.steps or example.steps, example.max_step)
         steps_made = np.shape(time_grid.intervals.length)[0] * time_grid.steps
@@ -254,7 +254,7 @@ def by_particles(problem: LikelihoodProblem, settings: ReferenceSettings, noise:
         count = max(count, min(final_count, _rounded(_FIRST_WORK / each_particle)))
     while True:
         start_time = time.perf_counter()
-        estimates = _particle_run(problem, count, settings)(problem, key)
+        estimates = _particle_estimates(problem, count, settings, key)
         if count >= final_count or (is_settled is not None and is_settled(estimates)):
             break
         more = min(4 * count, final_count)
@@ -281,7 +281,9 @@ _SAFETY = 1.2
 """Factor on the number of particles of the pilot run, which is an estimate."""
 
 
-def _particle_run(problem: LikelihoodProblem, particles: int, settings: ReferenceSettings) -> Callable:
+def _particle_estimates(problem: LikelihoodProblem, particles: int, settings: ReferenceSettings,
+                        key: jax.Array) -> np.ndarray:
+    """Return estimates (S, B, R) of the likelihoods of each series."""
     example, steps = problem.example, settings.steps
     check_noise(example.ssm, example.time_grid.initial_time)
     filter_settings = particle_filter.check_settings(example.ssm, ParticleSettings(particles))
@@ -308,11 +310,8 @@ def _particle_run(problem: LikelihoodProblem, particles: int, settings: Referenc
         # their averages.
         return jax.lax.map(replicate, jax.random.split(key, settings.replicates)).T
 
-    def run(problem: LikelihoodProblem, key: jax.Array) -> np.ndarray:
-        name = (f"particle filter, {particles:,} particles", filter_settings, settings.replicates, steps)
-        return _map_sequentially(problem, key, name, per_draw, settings.show_progress)
-
-    return run
+    name = (f"particle filter, {particles:,} particles", filter_settings, settings.replicates, steps)
+    return _map_sequentially(problem, key, name, per_draw, settings.show_progress)
 
 
 def _map_sequentially(problem: LikelihoodProblem, key: jax.Array, name: tuple[str, *tuple[Hashable, ...]],
