@@ -99,11 +99,9 @@ def _functions(columns_text: str | None, model: ModelFile, ways: Mapping[str, st
     columns = [tuple(part.strip() for part in text.partition(":")[::2]) for text in columns_text.split(",")]
     names = list(ways) or [column for column, _ in columns]
     if len(names) != len(columns) or len(set(columns)) < len(columns):
-        input_names = ", ".join(names)
-        raise ValueError(
-            f"{model.name} takes {checks.counted(len(names), 'known input')} ({input_names}); --inputs names "
-            f"{checks.counted(len(columns), 'column')}, which must be as many, each of them once."
-        )
+        raise ValueError(f"{model.name} takes {checks.counted(len(names), 'known input')} ({', '.join(names)}); "
+                         f"--inputs names {checks.counted(len(columns), 'column')}, which must be as many, each of "
+                         "them once.")
     return {name: (column, way or ways.get(name, "previous"))
             for name, (column, way) in zip(names, columns, strict=True)}
 
@@ -126,8 +124,7 @@ def _number(name: str, text: str) -> Any:
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
-        raise ValueError(
-            f"--set {name}: expected a number, numbers separated by commas, or {FREE!r}, got {text!r}."
-        ) from None
+        raise ValueError(f"--set {name}: expected a number, numbers separated by commas, or {FREE!r}, got "
+                         f"{text!r}.") from None
     checks.finite(f"--set {name}", np.array(values))
     return values[0] if len(values) == 1 else values

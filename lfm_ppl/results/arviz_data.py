@@ -111,11 +111,8 @@ def group(result: Any, name: str) -> xr.Dataset:
     if not has_group(result, name):
         if any(f"{name}_{site.replace('/', '.')}" in groups(result) for site in sites_of(result)):
             refuse_several_sites(result)
-        remedy = _HOW_TO_GET.get(name)
-        raise ValueError(
-            f"the result has no group {name!r}; it has {', '.join(groups(result)) or 'none'}."
-            + (f" {name!r} comes from {remedy}." if remedy else "")
-        )
+        remedy = f" {name!r} comes from {_HOW_TO_GET[name]}." if name in _HOW_TO_GET else ""
+        raise ValueError(f"the result has no group {name!r}; it has {', '.join(groups(result)) or 'none'}.{remedy}")
     dataset = result[name]
     return dataset.to_dataset() if isinstance(dataset, xr.DataTree) else dataset
 
@@ -215,15 +212,11 @@ def load(path: str | Path) -> Any:
     datasets, attrs = netcdf.read(path)
     library = attrs.get("inference_library")
     if library != LIBRARY:
-        raise ValueError(
-            f"{path} was not written by lfm_ppl (its inference_library is {library!r}). "
-            "Read it with ArviZ itself, arviz.from_netcdf."
-        )
+        raise ValueError(f"{path} was not written by lfm_ppl (its inference_library is {library!r}). Read it with "
+                         "ArviZ itself, arviz.from_netcdf.")
     if "posterior" not in datasets:
-        raise ValueError(
-            f"{path} holds no posterior; its groups are {', '.join(datasets) or 'none'}. "
-            "Expected the file that lfm.save or `lfm-ppl fit` wrote."
-        )
+        raise ValueError(f"{path} holds no posterior; its groups are {', '.join(datasets) or 'none'}. Expected the "
+                         "file that lfm.save or `lfm-ppl fit` wrote.")
     return build(datasets, attrs)
 
 
@@ -308,10 +301,9 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
         Messages that name the parameters, their values, and what to do; empty if all is well.
     """
     attrs = attributes(result)
-    constrained, from_mode = "constraints" in attrs, attrs.get("sampler") == "map"
-    of_sites = convergence.of_sites(
-        *json.loads(attrs.get(SITES, "[0, 0, 0]")), constrained=constrained, from_mode=from_mode
-    )
+    from_mode = attrs.get("sampler") == "map"
+    of_sites = convergence.of_sites(*json.loads(attrs.get(SITES, "[0, 0, 0]")), constrained="constraints" in attrs,
+                                    from_mode=from_mode)
     of_sites += convergence.of_weights(*json.loads(attrs.get(WEIGHTS, "[0, 0, 0]")))
     if of_mode(result):
         rows = summary(result) if table is None else table
@@ -322,10 +314,8 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     sizes = group(result, "posterior").sizes
     stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
     divergences = int(stats["diverging"].sum()) if "diverging" in stats else 0
-    messages = convergence.messages(
-        summary(result) if table is None else table, sizes["chain"], sizes["draw"], divergences
-    )
-    return messages + of_sites
+    rows = summary(result) if table is None else table
+    return convergence.messages(rows, sizes["chain"], sizes["draw"], divergences) + of_sites
 
 
 def mcse_mean(values: np.ndarray) -> float:

@@ -45,24 +45,19 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     sound = varying.drop(broken)
     warnings_found = []
     if len(broken):
-        warnings_found.append(
-            f"draws are not finite for {join_names(list(broken))}: nothing computed from them "
-            "holds. Tighten the priors, or choose starting values where the model is finite."
-        )
+        warnings_found.append(f"draws are not finite for {join_names(list(broken))}: nothing computed from them holds. "
+                              "Tighten the priors, or choose starting values where the model is finite.")
     if chains < 2:
-        warnings_found.append(
-            "R-hat needs at least two chains and there is one: agreement between chains was not "
-            "checked. Run with chains=4."
-        )
+        warnings_found.append("R-hat needs at least two chains and there is one: agreement between chains was not "
+                              "checked. Run with chains=4.")
     elif draws < 4:
         warnings_found.append(f"{draws} draws per chain are too few for R-hat and ESS. Raise samples.")
     high = sound["r_hat"][sound["r_hat"] > MAX_R_HAT].sort_values(ascending=False)
     if len(high):
         warnings_found.append(
-            f"R-hat is above {MAX_R_HAT} for {join_names(_with_values(high, '.3f'))}: the chains have "
-            "not reached the same distribution. Run longer (warmup, samples); if it stays, look "
-            "at the trace plot for several modes and for parameters that the data do not identify."
-        )
+            f"R-hat is above {MAX_R_HAT} for {join_names(_with_values(high, '.3f'))}: the chains have not reached the "
+            "same distribution. Run longer (warmup, samples); if it stays, look at the trace plot for several modes "
+            "and for parameters that the data do not identify.")
     minimum = MIN_ESS_PER_CHAIN * chains
     for kind, part in (("bulk", "centre"), ("tail", "tails")):
         low = sound[f"ess_{kind}"][sound[f"ess_{kind}"] < minimum].sort_values()
@@ -75,11 +70,9 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     if divergences:
         share = 100.0 * divergences / (chains * draws)
         warnings_found.append(
-            f"{divergences} of {chains * draws} transitions diverged ({share:.2g}%): draws may "
-            "miss a narrow region. Raise target_accept_prob to 0.95 or 0.99 (--target-accept), take "
-            "more steps where the integration breaks down, or reparameterise where the pairs plot "
-            "marks them."
-        )
+            f"{divergences} of {chains * draws} transitions diverged ({share:.2g}%): draws may miss a narrow region. "
+            "Raise target_accept_prob to 0.95 or 0.99 (--target-accept), take more steps where the integration breaks "
+            "down, or reparameterise where the pairs plot marks them.")
     return warnings_found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 
@@ -128,7 +129,4 @@ def _labels(name: str, variable: xr.DataArray) -> list[str]:
     if not dims:
         return [name]
     ticks = [variable[dim].values if dim in variable.coords else np.arange(variable.sizes[dim]) for dim in dims]
-    return [
-        f"{name}[{','.join(str(tick[i]) for tick, i in zip(ticks, index, strict=True))}]"
-        for index in np.ndindex(*(len(tick) for tick in ticks))
-    ]
+    return [f"{name}[{','.join(map(str, entry))}]" for entry in itertools.product(*ticks)]

@@ -23,13 +23,7 @@ from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.plots.trajectories import finish, pick, series_views
-from lfm_ppl.results.residuals import (
-    autocorrelation,
-    default_lags,
-    mean_residuals,
-    normal_scores,
-    residual_tests,
-)
+from lfm_ppl.results.residuals import autocorrelation, default_lags, mean_residuals, normal_scores, residual_tests
 
 MAX_OUTPUTS = 4
 _ENVELOPE = "#DDDDDD"

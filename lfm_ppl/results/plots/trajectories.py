@@ -303,11 +303,9 @@ def finish(figure: Figure, panels: list[Axes], result: Any, remark: str) -> None
 def _trajectories(result: Any, kind: str) -> xr.DataArray:
     dataset = group(result, "trajectories")
     if f"{kind}s" not in dataset or dataset.sizes[kind] == 0:
-        raise ValueError(
-            f"the result holds no {kind} trajectories; its group trajectories has "
-            f"{', '.join(map(str, dataset.data_vars))}. They come from lfm.fit with "
-            f"trajectory_draws above zero, for a model that has {kind}s."
-        )
+        raise ValueError(f"the result holds no {kind} trajectories; its group trajectories has "
+                         f"{', '.join(map(str, dataset.data_vars))}. They come from lfm.fit with trajectory_draws "
+                         f"above zero, for a model that has {kind}s.")
     return dataset[f"{kind}s"].transpose("chain", "draw", ..., "at", kind)
 
 
