@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
@@ -79,9 +78,8 @@ class LikelihoodProblem:
         """The same draws with one likelihood site selected, by name of the site."""
         if not self.bound.is_by_site:
             return {self.bound.site.name: self}
-        stores = self.stores
-        return {name: replace(self, bound=bound, stores=None if stores is None else functools.partial(
-            _site_store, stores, name)) for name, bound in self.bound.site_models.items()}
+        return {name: replace(self, bound=bound).rename_stores(suffix=f" of site {name}")
+                for name, bound in self.bound.site_models.items()}
 
     @property
     def size(self) -> int:
@@ -97,9 +95,10 @@ class LikelihoodProblem:
         """Return the same problem with some of the draws."""
         return replace(self, draws={name: value[rows] for name, value in self.draws.items()})
 
-
-def _site_store(stores: Callable[[str], BatchStore], site: str, name: str) -> BatchStore:
-    return stores(f"{name} of site {site}")
+    def rename_stores(self, prefix: str = "", suffix: str = "") -> LikelihoodProblem:
+        """Return the same problem, whose computations are stored under other names."""
+        stores = self.stores
+        return self if stores is None else replace(self, stores=lambda name: stores(f"{prefix}{name}{suffix}"))
 
 
 @dataclass(frozen=True)
@@ -239,9 +238,7 @@ def by_particles(problem: LikelihoodProblem, settings: ReferenceSettings, noise:
     final_count = count
     if settings.particles is None:
         rows = np.unique(np.linspace(0, problem.size - 1, _PILOT).round().astype(int))
-        stores = problem.stores
-        pilot_stores = None if stores is None else lambda name: stores(f"pilot {name}")
-        pilot = replace(problem.select(rows), stores=pilot_stores)
+        pilot = problem.select(rows).rename_stores(prefix="pilot ")
         sd = noise(_particle_estimates(pilot, count, settings, pilot_key))
         needed_particles = count * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
         time_grid = build_time_grid(example.ssm, example.times, settings.steps or example.steps, example.max_step)
