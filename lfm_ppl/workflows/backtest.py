@@ -24,7 +24,7 @@ from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable
 from lfm_ppl.results.rebuilding import parameter_draws
-from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary
+from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary, table
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.types import Times
 from lfm_ppl.workflows.data_binding import bind_dates
@@ -268,11 +268,6 @@ def _by_origin(dataset: xr.Dataset) -> pd.DataFrame:
 
 def _table(dataset: xr.Dataset, level: float) -> pd.DataFrame:
     outputs = [str(name) for name in dataset["output"].values]
-    rows = {}
-    for index, forecaster in enumerate(dataset["forecaster"].values):
-        picked = dataset.isel(forecaster=index)
-        for name in [*outputs, ALL]:
-            selected = picked if name == ALL else picked.sel(output=name)
-            rows[(str(forecaster), name)] = summary(_scores_of(selected), level)
-    table = pd.DataFrame.from_dict(rows, orient="index")
-    return table.set_index(pd.MultiIndex.from_tuples(rows, names=["forecaster", "output"]))
+    tables = {str(forecaster): table(_scores_of(dataset.sel(forecaster=forecaster)), outputs, level)
+              for forecaster in dataset["forecaster"].values}
+    return pd.concat(tables, names=["forecaster", "output"])
