@@ -39,12 +39,11 @@ def fixed(texts: Sequence[str], anchors: Mapping[str, float], options: Collectio
         if (option := name.partition("[")[0]) in options:
             option_flag = f"--option {option}={'VALUE' if value == FREE else value}"
             raise ValueError(f"--set {text}: {option} is an option of the model, not a parameter: {option_flag}.")
-        for anchor in list(values_by_name):
-            if anchor == name or anchor.partition("[")[0] == name:
-                del values_by_name[anchor]
+        values_by_name = {other: number for other, number in values_by_name.items()
+                          if name not in (other, other.partition("[")[0])}
         if value != FREE:
             values_by_name[name] = _number(name, value)
-        elif not any(anchor == name or anchor.partition("[")[0] == name for anchor in anchors):
+        elif not any(name in (anchor, anchor.partition("[")[0]) for anchor in anchors):
             anchor_names = ", ".join(anchors) or "none"
             raise ValueError(f"--set {text}: the model does not fix {name}; it fixes: {anchor_names}.")
     return values_by_name
