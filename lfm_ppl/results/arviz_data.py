@@ -123,13 +123,10 @@ def add_group(result: Any, name: str, dataset: xr.Dataset) -> Any:
     Returns:
         ``result``, which is changed in place.
     """
-    dataset = _checked(name, dataset)
-    if isinstance(result, xr.DataTree):
-        result[name] = xr.DataTree(dataset)
-        return result
-    if has_group(result, name):
-        del result[name]
-    result[name] = dataset
+    dataset, is_tree = _checked(name, dataset), isinstance(result, xr.DataTree)
+    if not is_tree:  # InferenceData does not replace a group
+        remove_group(result, name)
+    result[name] = xr.DataTree(dataset) if is_tree else dataset
     return result
 
 
