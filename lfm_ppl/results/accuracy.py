@@ -211,8 +211,7 @@ def _assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: 
         "noise_sd": (sample, np.sqrt(averaged.variance) if noisy else np.zeros_like(ratio)),
         **{name: ("parameter", table[name].to_numpy()) for name in table.columns},
     }
-    coords = {"chain": posterior["chain"].values if "chain" in posterior.coords else np.arange(filtered.shape[0]),
-              "draw": posterior["draw"].values[draw_index] if "draw" in posterior.coords else draw_index,
+    coords = {"chain": posterior["chain"].values, "draw": posterior["draw"].values[draw_index],
               "parameter": list(table.index)}
     return AccuracyReport(xr.Dataset(variables, coords, {
         "reference": reference.description, "pareto_k": weights.k, "threshold": weights.threshold,

@@ -170,9 +170,8 @@ def _family_densities(result: Any, numpyro_model: Callable, predicted: xr.Datase
                          "lfm.forecast returned, not its dataset.")
     problem = rebuilding.problem(result, numpyro_model, model_kwargs=rebuilding.keywords(result, inputs, model_kwargs))
     posterior = arviz_data.group(result, "posterior")
-    labels = posterior["draw"].values if "draw" in posterior.coords else np.arange(posterior.sizes["draw"])
-    draw_index = np.searchsorted(labels, predicted["draw"].values)
-    rows = (np.arange(posterior.sizes["chain"])[:, None] * len(labels) + draw_index).ravel()
+    draw_index = np.searchsorted(posterior["draw"].values, predicted["draw"].values)
+    rows = (np.arange(posterior.sizes["chain"])[:, None] * posterior.sizes["draw"] + draw_index).ravel()
     return log_densities(problem.bound, problem.select(rows).draws, predicted, y)
 
 
