@@ -22,7 +22,7 @@ from lfm_ppl.cli import fit, page, results, session
 from lfm_ppl.cli.options import CheckOptions
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.inference.posterior import evenly_spaced
-from lfm_ppl.results import arviz_data, checkpoint, files, likelihoods, rebuilding, tables
+from lfm_ppl.results import arviz_data, checkpoint, files, html_report, likelihoods, rebuilding, tables
 from lfm_ppl.results.accuracy import check_accuracy
 from lfm_ppl.results.correction import correct_posterior
 from lfm_ppl.results.report import GROUP, AccuracyReport
@@ -52,7 +52,7 @@ def run(result: str, options: CheckOptions, line: Sequence[str]) -> int:
     replace = options.overwrite or options.resume
     for name in (TABLE, FIGURE) if settled is None else ():
         atomic_files.refuse_existing(path.parent / name, replace)
-    page.refuse_foreign(path.parent, options.overwrite)
+    html_report.refuse_foreign(path.parent / html_report.NAME, options.overwrite)
     results.check_writable(path.parent)
     session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not options.no_cache)
     task = rebuild_fit(posterior, options.model, path)

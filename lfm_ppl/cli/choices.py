@@ -39,12 +39,11 @@ def fixed(texts: Sequence[str], anchors: Mapping[str, float], options: Collectio
         if (option := name.partition("[")[0]) in options:
             option_flag = f"--option {option}={'VALUE' if value == FREE else value}"
             raise ValueError(f"--set {text}: {option} is an option of the model, not a parameter: {option_flag}.")
-        for anchor in list(values_by_name):
-            if anchor == name or anchor.partition("[")[0] == name:
-                del values_by_name[anchor]
+        values_by_name = {other: number for other, number in values_by_name.items()
+                          if name not in (other, other.partition("[")[0])}
         if value != FREE:
             values_by_name[name] = _number(name, value)
-        elif not any(anchor == name or anchor.partition("[")[0] == name for anchor in anchors):
+        elif not any(name in (anchor, anchor.partition("[")[0]) for anchor in anchors):
             anchor_names = ", ".join(anchors) or "none"
             raise ValueError(f"--set {text}: the model does not fix {name}; it fixes: {anchor_names}.")
     return values_by_name
@@ -99,11 +98,9 @@ def _functions(columns_text: str | None, model: ModelFile, ways: Mapping[str, st
     columns = [tuple(part.strip() for part in text.partition(":")[::2]) for text in columns_text.split(",")]
     names = list(ways) or [column for column, _ in columns]
     if len(names) != len(columns) or len(set(columns)) < len(columns):
-        input_names = ", ".join(names)
-        raise ValueError(
-            f"{model.name} takes {checks.counted(len(names), 'known input')} ({input_names}); --inputs names "
-            f"{checks.counted(len(columns), 'column')}, which must be as many, each of them once."
-        )
+        raise ValueError(f"{model.name} takes {checks.counted(len(names), 'known input')} ({', '.join(names)}); "
+                         f"--inputs names {checks.counted(len(columns), 'column')}, which must be as many, each of "
+                         "them once.")
     return {name: (column, way or ways.get(name, "previous"))
             for name, (column, way) in zip(names, columns, strict=True)}
 
@@ -126,8 +123,7 @@ def _number(name: str, text: str) -> Any:
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
-        raise ValueError(
-            f"--set {name}: expected a number, numbers separated by commas, or {FREE!r}, got {text!r}."
-        ) from None
+        raise ValueError(f"--set {name}: expected a number, numbers separated by commas, or {FREE!r}, got "
+                         f"{text!r}.") from None
     checks.finite(f"--set {name}", np.array(values))
     return values[0] if len(values) == 1 else values

@@ -20,13 +20,9 @@ PAGE = "index.html"
 
 
 def run(entry: CatalogueEntry, values: Mapping[str, Any], options: StudyOptions, line: Sequence[str]) -> int:
-    """Run a study; stored results are not computed again. Return 1 if its page cannot be written.
+    """Run a study with the settings of the user; stored results are not computed again.
 
-    Args:
-        entry: the study.
-        values: the settings that the user gave, by name.
-        options: options of every study.
-        line: the words of the command line.
+    Return 1 if its page cannot be written.
     """
     report = None if options.quiet else Console()
     workers, study = options.processes.workers, entry.study

@@ -183,4 +183,5 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
           + (f", and {duration(earlier)} before it was stopped" if earlier > 0.05 * seconds + 1.0 else ""))
     for path in (*written, *figures):
         print(f"wrote    {path}")
-    return max(status, page.save(posterior, folder, overwrite, figures))
+    return max(status, page.report_failure(
+        lambda: html_report.save_report(posterior, folder / html_report.NAME, overwrite, figures=figures)))

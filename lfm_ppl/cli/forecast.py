@@ -27,7 +27,7 @@ from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
 from lfm_ppl.io.data_set import Data, InputTable, at_origin
 from lfm_ppl.model.inputs import Input
-from lfm_ppl.results import arviz_data, files, inputs, plots, tables
+from lfm_ppl.results import arviz_data, files, html_report, inputs, plots, tables
 from lfm_ppl.results.plots.trajectories import trajectory_names
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, MEAN, held_out_data, summary
 from lfm_ppl.results.series import select_series, series_dimension, series_labels
@@ -56,7 +56,7 @@ def run(result: str, options: ForecastOptions, line: Sequence[str]) -> int:
         else:
             for name in (TABLE, FIGURE, *MORE_FIGURES.values(), *([SCORES] if options.held_out else [])):
                 atomic_files.refuse_existing(folder / name, options.overwrite)
-            page.refuse_foreign(folder, options.overwrite)
+            html_report.refuse_foreign(folder / html_report.NAME, options.overwrite)
             if not options.overwrite and arviz_data.has_group(posterior, GROUP):
                 raise FileExistsError(f"{path} already holds predictions. Write to another folder with --out, or "
                                       "replace them with --overwrite.")

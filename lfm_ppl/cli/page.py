@@ -19,27 +19,9 @@ def command_line(line: Sequence[str], *more: str) -> str:
     return shlex.join(["lfm-ppl", *(word for word in line if word not in ("--overwrite", "--resume")), *more])
 
 
-def refuse_foreign(folder: Path, overwrite: bool) -> None:
-    """Raise FileExistsError for a ``report.html`` of another program; a report of lfm_ppl is replaced."""
-    html_report.refuse_foreign(folder / html_report.NAME, overwrite)
-
-
-def save(result: Any, folder: Path, overwrite: bool, figures: Sequence[Path]) -> int:
-    """Write the report with the figures (PNG files); return 1 if that fails."""
-    return report_failure(
-        lambda: html_report.save_report(result, folder / html_report.NAME, overwrite, figures=figures))
-
-
 def update(result: Any, folder: Path, figures: Sequence[Path] = (),
            more: Mapping[str, pd.DataFrame] | None = None) -> int:
-    """Write the report of an extended result; return 1 if that fails.
-
-    Args:
-        result: an ArviZ object.
-        folder: folder of the result and its figures.
-        figures: further figures.
-        more: further tables, see `lfm_ppl.save_report`.
-    """
+    """Write the report of an extended result beside it, with further figures and tables; return 1 if that fails."""
     def write() -> Path:
         from lfm_ppl.results.plots.saving import pages_of
 

@@ -5,12 +5,11 @@
    replicates of a particle filter.
 3. Smooth the importance weights (Pareto), and correct the moments of the parameters.
 4. `judge` turns the numbers into a verdict: trust, corrected, re-run or inconclusive.
-
-Source: Vehtari et al. (2024), JMLR 25(72); Andrieu and Roberts (2009), Annals of Statistics 37(2).
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
 from collections.abc import Callable, Mapping
@@ -28,7 +27,7 @@ from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding, run_record
 from lfm_ppl.results import checkpoint as checkpoints
-from lfm_ppl.results.approximation import more_iterations
+from lfm_ppl.results.approximation import finite_sd, more_iterations
 from lfm_ppl.results.likelihoods import LikelihoodProblem, Reference, ReferenceSettings
 from lfm_ppl.results.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.results.scalars import choose, scalar_draws
@@ -131,7 +130,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
             "versions": run_record.versions(),
             "draws of the result": run_record.digest(*full_problem.draws.values()),
         }, resume)  # fmt: skip
-    with checkpoints.closing(run):
+    with contextlib.closing(run) if run else contextlib.nullcontext():
         problem = replace(full_problem.select(rows), stores=None if run is None else run.batches)
         settings = {name: ReferenceSettings(kind, particles, replicates, steps, seed, progress)
                     for name, kind in kinds.items()}
@@ -150,16 +149,17 @@ def _report(result: Any, problem: LikelihoodProblem, draw_index: np.ndarray,
         site_result = select_site(result, name) if arviz_data.sites_of(result) else result
         recorded = likelihoods.recorded(site, filtered[name].ravel()).reshape(shape)
         rebuilding.check_likelihood(site_result, recorded, draw_index)
-    doubled = [likelihoods.gaussian_with_finer_steps(site).reshape(shape) for site in sites.values()]
+    doubled = [likelihoods.gaussian(site, "log likelihoods with finer steps", **likelihoods.finer_steps(site.example))
+               for site in sites.values()]
     iterated, refinements = dict(filtered), {name: more_iterations(site.example) for name, site in sites.items()}
     for name, refinement in refinements.items():
         if refinement is not None:
-            refined = replace(sites[name], bound=sites[name].bound.approximate(**refinement.settings))
-            iterated[name] = likelihoods.gaussian(refined, "log likelihoods with more iterations").reshape(shape)
+            iterated[name] = likelihoods.gaussian(sites[name], "log likelihoods with more iterations",
+                                                  **refinement.settings).reshape(shape)
     references = {name: _reference(site, filtered[name], settings[name], len(sites)) for name, site in sites.items()}
-    return assess(result, draw_index, np.sum([*filtered.values()], axis=0), np.sum(doubled, axis=0),
-                  _of_all_sites(references), problem,
-                  np.sum([*iterated.values()], axis=0) if any(refinements.values()) else None)
+    return _assess(result, draw_index, np.sum([*filtered.values()], axis=0), np.sum(doubled, axis=0).reshape(shape),
+                   _of_all_sites(references), problem,
+                   np.sum([*iterated.values()], axis=0) if any(refinements.values()) else None)
 
 
 def _of_all_sites(references: Mapping[str, Reference]) -> Reference:
@@ -175,18 +175,11 @@ def _of_all_sites(references: Mapping[str, Reference]) -> Reference:
         max(reference.particles for reference in values), any(reference.limited for reference in values))
 
 
-def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
-           problem: LikelihoodProblem, iterated: np.ndarray | None = None) -> AccuracyReport:
-    """Return the report from log likelihoods at draws.
+def _assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
+            problem: LikelihoodProblem, iterated: np.ndarray | None) -> AccuracyReport:
+    """Return the report from log likelihoods (C, S) at draws ``draw_index`` (S,) of each chain.
 
-    Args:
-        result: with the posterior.
-        draw_index: (S,), draws of each chain.
-        filtered: (C, S), log likelihoods of the Gaussian filter.
-        doubled: (C, S), with twice as many steps.
-        reference: log likelihoods of the reference.
-        problem: model and data.
-        iterated: (C, S), with more iterations of posterior linearisation; None where there are none to add.
+    They are those of the Gaussian filter, also with twice as many steps and with more iterations (None: no more).
     """
     posterior = arviz_data.group(result, "posterior")
     averaged = _summed(reference.estimates.reshape(*filtered.shape, *reference.estimates.shape[1:]))
@@ -208,9 +201,8 @@ def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: n
         sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.steps, max_step=example.max_step,
         tolerance=example.tolerance)
     if iterated is not None and (refinement := more_iterations(example)) is not None:
-        findings = replace(findings, 
-            iterations=refinement.settings["iterations"], ratio_sd=_finite_sd(ratio),
-            iterated_ratio_sd=_finite_sd(averaged.log_mean - iterated))
+        findings = replace(findings, iterations=refinement.settings["iterations"], ratio_sd=finite_sd(ratio),
+                           iterated_ratio_sd=finite_sd(averaged.log_mean - iterated))
     verdict = judge(findings)
     sample = ("chain", "draw")
     variables = {
@@ -219,8 +211,7 @@ def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: n
         "noise_sd": (sample, np.sqrt(averaged.variance) if noisy else np.zeros_like(ratio)),
         **{name: ("parameter", table[name].to_numpy()) for name in table.columns},
     }
-    coords = {"chain": posterior["chain"].values if "chain" in posterior.coords else np.arange(filtered.shape[0]),
-              "draw": posterior["draw"].values[draw_index] if "draw" in posterior.coords else draw_index,
+    coords = {"chain": posterior["chain"].values, "draw": posterior["draw"].values[draw_index],
               "parameter": list(table.index)}
     return AccuracyReport(xr.Dataset(variables, coords, {
         "reference": reference.description, "pareto_k": weights.k, "threshold": weights.threshold,
@@ -230,11 +221,6 @@ def assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: n
         "step_change_sd": findings.step_change_sd, "steps": example.steps, "available_draws": findings.available,
         "verdict": verdict.word, "reason": verdict.reason, "command": verdict.command,
         "remedies": json.dumps(verdict.remedies)}))
-
-
-def _finite_sd(values: np.ndarray) -> float:
-    """Return the standard deviation; infinite where a value is not finite."""
-    return float(values.std()) if np.isfinite(values).all() else np.inf
 
 
 def noise(averaged: importance.Averaged) -> float:

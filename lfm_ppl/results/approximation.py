@@ -15,7 +15,7 @@ The refined likelihood is not exact either: `lfm_ppl.check_accuracy` compares wi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -100,9 +100,7 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
 
     def change(*selected: Refinement) -> float:
         settings = {name: value for refinement in selected for name, value in refinement.settings.items()}
-        refined = likelihoods.gaussian(replace(problem, bound=bound.approximate(**settings)))
-        difference = refined - fitted
-        return float(difference.std()) if np.isfinite(difference).all() else np.inf
+        return finite_sd(likelihoods.gaussian(problem, **settings) - fitted)
 
     total = change(*refinements)
     if total <= LARGEST_CHANGE:
@@ -116,17 +114,17 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
 
 
 def resolution_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray]) -> list[str]:
-    """Return messages on steps and forces that are too coarse at the posterior medians of the parameters.
-
-    Args:
-        bound: the model and its data.
-        draws: site name -> (S, ...), posterior draws.
-    """
+    """Return messages on steps and forces that are too coarse at the posterior medians of the parameters."""
     likelihood = bound.likelihood({name: np.median(values, axis=0) for name, values in draws.items()})
     y = np.asarray(bound.y)
     if isinstance(likelihood, Panel):
         likelihood, y = likelihood.first, y[0]
     return [*_long_steps(likelihood), *resolution_messages(likelihood.model, likelihood.times, y)]
+
+
+def finite_sd(values: np.ndarray) -> float:
+    """Return the standard deviation; infinite where a value is not finite."""
+    return float(values.std()) if np.isfinite(values).all() else np.inf
 
 
 def _long_steps(likelihood: SeriesLikelihood) -> list[str]:

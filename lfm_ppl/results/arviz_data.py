@@ -111,11 +111,8 @@ def group(result: Any, name: str) -> xr.Dataset:
     if not has_group(result, name):
         if any(f"{name}_{site.replace('/', '.')}" in groups(result) for site in sites_of(result)):
             refuse_several_sites(result)
-        remedy = _HOW_TO_GET.get(name)
-        raise ValueError(
-            f"the result has no group {name!r}; it has {', '.join(groups(result)) or 'none'}."
-            + (f" {name!r} comes from {remedy}." if remedy else "")
-        )
+        remedy = f" {name!r} comes from {_HOW_TO_GET[name]}." if name in _HOW_TO_GET else ""
+        raise ValueError(f"the result has no group {name!r}; it has {', '.join(groups(result)) or 'none'}.{remedy}")
     dataset = result[name]
     return dataset.to_dataset() if isinstance(dataset, xr.DataTree) else dataset
 
@@ -126,13 +123,10 @@ def add_group(result: Any, name: str, dataset: xr.Dataset) -> Any:
     Returns:
         ``result``, which is changed in place.
     """
-    dataset = _checked(name, dataset)
-    if isinstance(result, xr.DataTree):
-        result[name] = xr.DataTree(dataset)
-        return result
-    if has_group(result, name):
-        del result[name]
-    result[name] = dataset
+    dataset, is_tree = _checked(name, dataset), isinstance(result, xr.DataTree)
+    if not is_tree:  # InferenceData does not replace a group
+        remove_group(result, name)
+    result[name] = xr.DataTree(dataset) if is_tree else dataset
     return result
 
 
@@ -215,38 +209,12 @@ def load(path: str | Path) -> Any:
     datasets, attrs = netcdf.read(path)
     library = attrs.get("inference_library")
     if library != LIBRARY:
-        raise ValueError(
-            f"{path} was not written by lfm_ppl (its inference_library is {library!r}). "
-            "Read it with ArviZ itself, arviz.from_netcdf."
-        )
+        raise ValueError(f"{path} was not written by lfm_ppl (its inference_library is {library!r}). Read it with "
+                         "ArviZ itself, arviz.from_netcdf.")
     if "posterior" not in datasets:
-        raise ValueError(
-            f"{path} holds no posterior; its groups are {', '.join(datasets) or 'none'}. "
-            "Expected the file that lfm.save or `lfm-ppl fit` wrote."
-        )
+        raise ValueError(f"{path} holds no posterior; its groups are {', '.join(datasets) or 'none'}. Expected the "
+                         "file that lfm.save or `lfm-ppl fit` wrote.")
     return build(datasets, attrs)
-
-
-def rhat(result: Any) -> pd.Series:
-    """Return the rank-normalised split R-hat of every scalar parameter, by label.
-
-    NaN where it does not exist: one chain, fewer than four draws, a constant or non-finite chain.
-    Source: Vehtari et al. (2021), Bayesian Analysis 16(2), eq. 3 and section 4.1.
-    """
-    return _diagnostic(result, lambda draws: load_arviz().rhat(draws), min_chains=2)
-
-
-def ess(result: Any, method: str = "bulk") -> pd.Series:
-    """Return the effective sample size of every scalar parameter, by label.
-
-    Args:
-        result: an ArviZ object with a posterior.
-        method: "bulk", or "tail" for the smaller one of the 5% and 95% quantiles.
-    """
-    if method == "tail":
-        # ArviZ 1.x has another default probability than 0.23.
-        return _diagnostic(result, lambda draws: load_arviz().ess(draws, method="tail", prob=(0.05, 0.95)))
-    return _diagnostic(result, lambda draws: load_arviz().ess(draws, method=method))
 
 
 def summary(result: Any) -> pd.DataFrame:
@@ -257,10 +225,13 @@ def summary(result: Any) -> pd.DataFrame:
 
     Returns:
         Columns mean, sd, q2.5, q97.5 (quantiles in percent), truth (where a result has it), mcse_mean, ess_bulk,
-        ess_tail, r_hat; rows labelled ``noise_sd`` or ``decay[CDKN1A]``. Resampled draws are no chains: the effective
-        size is that of the importance weights, and there is no R-hat. Draws of a Laplace approximation (sampler "map")
-        are independent: the columns are mode, mean, sd, q2.5, q97.5, truth, and ``warnings`` where the mode of a
-        parameter is degenerate. A run that was stopped has a further column, ``partial``, with the number of draws.
+        ess_tail (the smaller one of those of the 5% and 95% quantiles), r_hat (rank-normalised split R-hat); rows
+        labelled ``noise_sd`` or ``decay[CDKN1A]``. Diagnostics are NaN where they do not exist: R-hat of one chain, and
+        those of fewer than four draws, or of draws that are constant or not finite. Resampled draws are no chains: the
+        effective size is that of the importance weights, and there is no R-hat. Draws of a Laplace approximation
+        (sampler "map") are independent: the columns are mode, mean, sd, q2.5, q97.5, truth, and ``warnings`` where the
+        mode of a parameter is degenerate. A run that was stopped has a further column, ``partial``, with the number of
+        draws.
 
     Raises:
         ValueError: the result has no posterior.
@@ -270,11 +241,12 @@ def summary(result: Any) -> pd.DataFrame:
         >>> posterior = xr.Dataset({"decay": (("chain", "draw"), draws)})
         >>> list(summary(build({"posterior": posterior})).index)
         ['decay']
+
+    Source: Vehtari et al. (2021), Bayesian Analysis 16(2), eq. 3 and section 4.1.
     """
     draws = scalar_draws(group(result, "posterior"))
     with np.errstate(invalid="ignore"):  # of draws that are not finite
         quantiles = {label: np.quantile(values, (0.025, 0.975)) for label, values in draws.items()}
-    resampled = attributes(result).get("effective_draws")
     moments = {
         "mean": {label: _mean(values) for label, values in draws.items()},
         "sd": {label: _sd(values) for label, values in draws.items()},
@@ -288,18 +260,15 @@ def summary(result: Any) -> pd.DataFrame:
         if degenerate := _degenerate(result):
             table["warnings"] = ["degenerate mode" if label in degenerate else "" for label in table.index]
         return table
-    table = pd.DataFrame(
-        {
-            **moments,
-            "mcse_mean": _diagnostic(result, lambda values: load_arviz().mcse(values, method="mean")),
-            "ess_bulk": ess(result, "bulk"),
-            "ess_tail": ess(result, "tail"),
-            "r_hat": rhat(result),
-        },
-        index=list(draws),
-        dtype=float,
-    )
-    if resampled is not None:
+    diagnostics = {
+        "mcse_mean": _diagnostic(draws, load_arviz().mcse, method="mean"),
+        "ess_bulk": _diagnostic(draws, load_arviz().ess, method="bulk"),
+        # ArviZ 1.x has another default probability than 0.23.
+        "ess_tail": _diagnostic(draws, load_arviz().ess, method="tail", prob=(0.05, 0.95)),
+        "r_hat": _diagnostic(draws, load_arviz().rhat, min_chains=2),
+    }
+    table = pd.DataFrame({**moments, **diagnostics}, index=list(draws), dtype=float)
+    if (resampled := attributes(result).get("effective_draws")) is not None:
         table["mcse_mean"] = table["sd"] / np.sqrt(resampled)
         table["ess_bulk"] = float(resampled)
         table[["ess_tail", "r_hat"]] = np.nan
@@ -330,10 +299,9 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
         Messages that name the parameters, their values, and what to do; empty if all is well.
     """
     attrs = attributes(result)
-    constrained, from_mode = "constraints" in attrs, attrs.get("sampler") == "map"
-    of_sites = convergence.of_sites(
-        *json.loads(attrs.get(SITES, "[0, 0, 0]")), constrained=constrained, from_mode=from_mode
-    )
+    from_mode = attrs.get("sampler") == "map"
+    of_sites = convergence.of_sites(*json.loads(attrs.get(SITES, "[0, 0, 0]")), constrained="constraints" in attrs,
+                                    from_mode=from_mode)
     of_sites += convergence.of_weights(*json.loads(attrs.get(WEIGHTS, "[0, 0, 0]")))
     if of_mode(result):
         rows = summary(result) if table is None else table
@@ -344,10 +312,8 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     sizes = group(result, "posterior").sizes
     stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
     divergences = int(stats["diverging"].sum()) if "diverging" in stats else 0
-    messages = convergence.messages(
-        summary(result) if table is None else table, sizes["chain"], sizes["draw"], divergences
-    )
-    return messages + of_sites
+    rows = summary(result) if table is None else table
+    return convergence.messages(rows, sizes["chain"], sizes["draw"], divergences) + of_sites
 
 
 def mcse_mean(values: np.ndarray) -> float:
@@ -412,15 +378,11 @@ def _degenerate(result: Any) -> list[str]:
     return [labels[name][index] for name, indices in variables.items() if name in labels for index in indices]
 
 
-def _diagnostic(result: Any, measure: Callable[[np.ndarray], Any], min_chains: int = 1) -> pd.Series:
-    """Apply ``measure`` to the (chain, draw) array of every scalar where it is defined."""
-    values = {}
-    for label, draws in scalar_draws(group(result, "posterior")).items():
-        defined = (
-            draws.shape[0] >= min_chains and draws.shape[1] >= 4 and np.all(np.isfinite(draws)) and np.ptp(draws) > 0.0
-        )
-        values[label] = float(measure(draws)) if defined else np.nan
-    return pd.Series(values, dtype=float)
+def _diagnostic(draws: Mapping[str, np.ndarray], measure: Callable, min_chains: int = 1,
+                **options: Any) -> dict[str, float]:
+    """Return ``measure`` of the draws (chain, draw) of every scalar; NaN where it is not defined."""
+    return {label: float(measure(values, **options)) if values.shape[0] >= min_chains and values.shape[1] >= 4
+            and np.isfinite(values).all() and np.ptp(values) > 0.0 else np.nan for label, values in draws.items()}
 
 
 def _mean(values: np.ndarray) -> float:

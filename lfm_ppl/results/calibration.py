@@ -4,15 +4,12 @@
 2. Sample the posterior, and rank the true parameters and the log likelihood among thinned draws.
 3. Many data sets run as tasks; the data sets of a task share one compiled program.
 4. Uniform ranks indicate a calibrated sampler (`p_values`).
-
-Source: Talts et al. (2018), arXiv:1804.06788; Modrak et al. (2023), Bayesian Analysis, for the log likelihood.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
+from scipy import stats
 
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.likelihood_site import likelihood_site
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.parallel.cluster import Workers
 from lfm_ppl.parallel.run import run_tasks
 from lfm_ppl.parallel.task import Task
@@ -102,8 +99,8 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
         >>> {name: rank.shape for name, rank in found.ranks.items()}
         {'level': (5,), 'log likelihood': (5,)}
 
-    Source: Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration; Modrak et
-    al. (2023), Bayesian Analysis, for the log likelihood as a test quantity.
+    Source: Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
+    arXiv:1804.06788; Modrak et al. (2023), Bayesian Analysis, for the log likelihood as a test quantity.
     """
     checks.random_key(key)
     for name, value in (("data_sets", data_sets), ("draws", draws), ("thin", thin), ("warmup", warmup)):
@@ -114,7 +111,7 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
     if method is not None:
         checks.one_of("method", method, METHODS)
     compute = _Ranks(model, np.asarray(times, float), kernel, draws, thin, warmup, batch, method)
-    compute.check()
+    likelihood_site(model, (compute.times,), {}, jax.random.key(0))  # raises an error before anything is computed
     truth_keys, chain_keys = (np.asarray(jax.random.key_data(jax.random.split(subkey, data_sets)))
                               for subkey in jax.random.split(key))
     settings = {"key": np.asarray(jax.random.key_data(key)).ravel().tolist(), "times": compute.times.tolist(),
@@ -127,7 +124,7 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
     return Calibration({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, draws)
 
 
-@dataclasses.dataclass(eq=False)
+@dataclass(eq=False)
 class _Ranks:
     """From a task, the keys of some data sets, to the ranks of the true values in them."""
 
@@ -139,10 +136,6 @@ class _Ranks:
     warmup: int
     batch: int
     method: str | None = None
-
-    def check(self) -> None:
-        """Raise where the model has no likelihood site, before anything is computed."""
-        likelihood_site(self.model, (self.times,), {}, jax.random.key(0))
 
     @functools.cached_property
     def program(self) -> Callable:
@@ -164,19 +157,19 @@ class _Ranks:
             posterior[LOG_LIKELIHOOD] = jax.lax.map(score, posterior)
             return {n: (posterior[n] < truth[n]).sum(0) for n in truth}
 
+        # By default sequentially if sites take different numbers of iterations.
+        method = self.method or ("sequential" if site.example.has_sites else "vectorized")
         # jax.lax.map with a batch size would evaluate both branches of each condition.
-        side_by_side = self.batch > 1 and self._method(site.example) == "vectorized"
-        return jax.jit(lambda keys: jax.lax.map(rank_statistics, keys, batch_size=self.batch if side_by_side else None))
-
-    def _method(self, likelihood: SeriesLikelihood) -> str:
-        """Return how the data sets of a task run: sequentially if sites take different numbers of iterations."""
-        return self.method or ("sequential" if likelihood.has_sites else "vectorized")
+        batch_size = self.batch if self.batch > 1 and method == "vectorized" else None
+        return jax.jit(lambda keys: jax.lax.map(rank_statistics, keys, batch_size=batch_size))
 
     def __call__(self, task: Task) -> dict[str, np.ndarray]:
         """Return name of a scalar -> ranks."""
         *keys, kind = task.data
-        results = self.program(tuple(jax.random.wrap_key_data(jnp.asarray(key_data), impl=kind) for key_data in keys))
-        return _scalars({name: np.asarray(value) for name, value in results.items()})
+        keys = tuple(jax.random.wrap_key_data(jnp.asarray(key_data), impl=kind) for key_data in keys)
+        ranks = jax.device_get(self.program(keys))
+        return {f"{name}[{','.join(map(str, index))}]" if index else name: value[:, *index]
+                for name, value in ranks.items() for index in np.ndindex(value.shape[1:])}
 
 
 def _name(function: Callable) -> str:
@@ -195,31 +188,6 @@ def _chain(kernel: Any, arguments: tuple, key: jax.Array, draws: int, thin: int,
     return jax.vmap(kernel.postprocess_fn(arguments, {}))(collected)
 
 
-def _scalars(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    flat = {}
-    for name, value in values.items():
-        for index in np.ndindex(value.shape[1:]):
-            flat[f"{name}[{','.join(map(str, index))}]" if index else name] = value[(slice(None), *index)]
-    return flat
-
-
-def chi_square(rank: np.ndarray, draws: int, bins: int) -> float:
-    """Return Pearson's statistic of ranks in ``bins`` bins of equal width; draws + 1 must be a multiple of bins."""
-    if (draws + 1) % bins:
-        raise ValueError(f"{draws} draws give {draws + 1} possible ranks, which do not fall into {bins} bins of equal "
-                         "width; choose a divisor.")
-    counts = np.bincount(rank * bins // (draws + 1), minlength=bins)
-    expected = len(rank) / bins
-    return float(((counts - expected) ** 2 / expected).sum())
-
-
-def ecdf_distance(rank: np.ndarray, draws: int) -> float:
-    """Return the largest distance of the empirical distribution function of the ranks from the uniform one."""
-    counts = np.bincount(rank, minlength=draws + 1)
-    uniform = np.arange(1, draws + 2) / (draws + 1)
-    return float(np.abs(counts.cumsum() / len(rank) - uniform).max())
-
-
 def p_values(rank: np.ndarray, draws: int, bins: int = 16) -> dict[str, float]:
     """Test that ranks are uniform on 0..draws.
 
@@ -229,22 +197,27 @@ def p_values(rank: np.ndarray, draws: int, bins: int = 16) -> dict[str, float]:
         bins: of the chi-square statistic; a divisor of draws + 1.
 
     Returns:
-        ``chi-square`` and ``ecdf`` (the largest distance of the distribution functions), by simulation under
-        uniform ranks, so that neither rests on asymptotics.
+        ``chi-square`` (Pearson's statistic) and ``ecdf`` (the largest distance of the distribution functions), by
+        simulation under uniform ranks, so that neither rests on asymptotics.
+
+    Raises:
+        ValueError: ``bins`` is no divisor of draws + 1.
 
     Example:
         >>> low = np.zeros(100, int)
         >>> p_values(low, 63)["chi-square"] < 0.001
         True
     """
-    null = np.random.default_rng(0).integers(0, draws + 1, (_SIMULATIONS, len(rank)))
-    results = {}
-    for name, statistic in (("chi-square", lambda r: chi_square(r, draws, bins)),
-                            ("ecdf", lambda r: ecdf_distance(r, draws))):
-        simulated = np.array([statistic(row) for row in null])
-        # The observed one counts among the simulated, so that no p-value is zero.
-        results[name] = float((1 + (simulated >= statistic(rank) - 1e-12).sum()) / (_SIMULATIONS + 1))
-    return results
+    if (draws + 1) % bins:
+        raise ValueError(f"{draws} draws give {draws + 1} possible ranks, which do not fall into {bins} bins of equal "
+                         "width; choose a divisor.")
+    simulated = np.random.default_rng(0).integers(0, draws + 1, (_SIMULATIONS, len(rank)))
+    # The observed ranks, in the first row, count among the simulated, so that no p-value is zero.
+    counts = np.stack([np.bincount(row, minlength=draws + 1) for row in (rank, *simulated)])
+    uniform = np.arange(1, draws + 2) / (draws + 1)
+    statistics = {"chi-square": stats.chisquare(counts.reshape(len(counts), bins, -1).sum(axis=-1), axis=1).statistic,
+                  "ecdf": np.abs(counts.cumsum(axis=1) / len(rank) - uniform).max(axis=1)}
+    return {name: float((values >= values[0] - 1e-12).mean()) for name, values in statistics.items()}
 
 
 def save(calibration: Calibration, path: str | Path, overwrite: bool = False) -> Path:

@@ -64,12 +64,7 @@ class Checkpoint:
 
     @classmethod
     def begin(cls, folder: str | Path, record: Mapping[str, Any]) -> Checkpoint:
-        """Begin a run, and remove an earlier one.
-
-        Args:
-            folder: folder of the result, made if necessary.
-            record: record of the run.
-        """
+        """Begin a run in the folder of its result, and remove an earlier one."""
         checkpoint = cls(Path(folder))
         checkpoint._store.lock()
         checkpoint._store.clear()
@@ -301,13 +296,3 @@ def begin_or_resume(folder: str | Path, record: Mapping[str, Any], resume: bool)
     if resume and has_run(folder):
         return Checkpoint.resume(folder, record)
     return Checkpoint.begin(folder, record)
-
-
-@contextlib.contextmanager
-def closing(checkpoint: Checkpoint | None) -> Iterator[None]:
-    """Close a checkpoint, if there is one, at the end of the block."""
-    try:
-        yield
-    finally:
-        if checkpoint is not None:
-            checkpoint.close()

@@ -4,7 +4,7 @@
 2. Divergences, unconverged sites and few weighted trajectories give further messages.
 3. Each message names the number, its threshold and the remedy.
 
-Source: Vehtari et al. (2021), Bayesian Analysis 16.
+Source: Vehtari et al. (2021), Bayesian Analysis 16(2), for the thresholds.
 """
 
 from __future__ import annotations
@@ -39,41 +39,40 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     Returns:
         Messages that name parameters, values and a remedy; empty where nothing is wrong.
         Rows that do not vary (fixed or derived from fixed values) are passed over.
-        Source of the thresholds: Vehtari et al. (2021), Bayesian Analysis 16(2).
     """
     varying = summary[summary["sd"] != 0.0]
     broken = varying.index[~np.isfinite(varying["mean"])]
     sound = varying.drop(broken)
     warnings_found = []
     if len(broken):
-        warnings_found.append(
-            f"draws are not finite for {join_names(list(broken))}: nothing computed from them "
-            "holds. Tighten the priors, or choose starting values where the model is finite."
-        )
+        warnings_found.append(f"draws are not finite for {join_names(list(broken))}: nothing computed from them holds. "
+                              "Tighten the priors, or choose starting values where the model is finite.")
     if chains < 2:
-        warnings_found.append(
-            "R-hat needs at least two chains and there is one: agreement between chains was not "
-            "checked. Run with chains=4."
-        )
+        warnings_found.append("R-hat needs at least two chains and there is one: agreement between chains was not "
+                              "checked. Run with chains=4.")
     elif draws < 4:
         warnings_found.append(f"{draws} draws per chain are too few for R-hat and ESS. Raise samples.")
     high = sound["r_hat"][sound["r_hat"] > MAX_R_HAT].sort_values(ascending=False)
     if len(high):
         warnings_found.append(
-            f"R-hat is above {MAX_R_HAT} for {join_names(_with_values(high, '.3f'))}: the chains have "
-            "not reached the same distribution. Run longer (warmup, samples); if it stays, look "
-            "at the trace plot for several modes and for parameters that the data do not identify."
-        )
-    for column, part in (("ess_bulk", "centre"), ("ess_tail", "tails")):
-        warnings_found += _low_ess(sound[column], column.removeprefix("ess_"), part, chains)
+            f"R-hat is above {MAX_R_HAT} for {join_names(_with_values(high, '.3f'))}: the chains have not reached the "
+            "same distribution. Run longer (warmup, samples); if it stays, look at the trace plot for several modes "
+            "and for parameters that the data do not identify.")
+    minimum = MIN_ESS_PER_CHAIN * chains
+    for kind, part in (("bulk", "centre"), ("tail", "tails")):
+        low = sound[f"ess_{kind}"][sound[f"ess_{kind}"] < minimum].sort_values()
+        if len(low):
+            warnings_found.append(
+                f"{kind} effective sample size is below {minimum} ({MIN_ESS_PER_CHAIN} per chain) for "
+                f"{join_names(_with_values(low, '.0f'))}: too little is known of the {part} of the posterior. Raise "
+                f"samples (or thin) about {math.ceil(minimum / max(low.iloc[0], 1.0))}-fold, or lower the correlation "
+                "between parameters.")
     if divergences:
         share = 100.0 * divergences / (chains * draws)
         warnings_found.append(
-            f"{divergences} of {chains * draws} transitions diverged ({share:.2g}%): draws may "
-            "miss a narrow region. Raise target_accept_prob to 0.95 or 0.99 (--target-accept), take "
-            "more steps where the integration breaks down, or reparameterise where the pairs plot "
-            "marks them."
-        )
+            f"{divergences} of {chains * draws} transitions diverged ({share:.2g}%): draws may miss a narrow region. "
+            "Raise target_accept_prob to 0.95 or 0.99 (--target-accept), take more steps where the integration breaks "
+            "down, or reparameterise where the pairs plot marks them.")
     return warnings_found
 
 
@@ -151,19 +150,6 @@ def log_mean_error(worth: float, count: int) -> float:
         count: N; with fewer than two nothing is known.
     """
     return math.sqrt(max(count / worth - 1.0, 0.0) / (count - 1)) if count > 1 else math.nan
-
-
-def _low_ess(ess: pd.Series, kind: str, part: str, chains: int) -> list[str]:
-    minimum = MIN_ESS_PER_CHAIN * chains
-    low = ess[ess < minimum].sort_values()
-    if not len(low):
-        return []
-    factor = math.ceil(minimum / max(low.iloc[0], 1.0))
-    return [
-        f"{kind} effective sample size is below {minimum} ({MIN_ESS_PER_CHAIN} per chain) for "
-        f"{join_names(_with_values(low, '.0f'))}: too little is known of the {part} of the posterior. "
-        f"Raise samples (or thin) about {factor}-fold, or lower the correlation between parameters."
-    ]
 
 
 def _with_values(values: pd.Series, form: str) -> list[str]:

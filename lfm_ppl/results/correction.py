@@ -73,12 +73,10 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
 
 def _select_draws(posterior: xr.Dataset, picked: np.ndarray) -> xr.Dataset:
     """Return the draws ``picked`` (C, S), indices into all chains joined, as chains."""
-    chain, draw = np.divmod(picked, posterior.sizes["draw"])
-    index = {"chain": xr.DataArray(chain, dims=("to_chain", "to_draw")),
-             "draw": xr.DataArray(draw, dims=("to_chain", "to_draw"))}
-    selected = posterior.isel(index).drop_vars(["chain", "draw"], errors="ignore")
-    selected = selected.rename({"to_chain": "chain", "to_draw": "draw"}).transpose("chain", "draw", ...)
-    return selected.assign_coords(chain=np.arange(picked.shape[0]), draw=np.arange(picked.shape[1]))
+    chain, draw = (xr.DataArray(index, dims=("chain", "draw")) for index in np.divmod(picked, posterior.sizes["draw"]))
+    selected = posterior.drop_vars(["chain", "draw"], errors="ignore").isel(chain=chain, draw=draw)
+    return selected.transpose("chain", "draw", ...).assign_coords(
+        chain=np.arange(picked.shape[0]), draw=np.arange(picked.shape[1]))
 
 
 def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwargs: Mapping[str, Any] | None,

@@ -28,7 +28,7 @@ from markupsafe import Markup
 from lfm_ppl.results import arviz_data, predictions, report, tables
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import ORIGIN, input_unit, inputs_of, time_origin, time_unit
-from lfm_ppl.results.plots import saving, style
+from lfm_ppl.results.plots import saving
 from lfm_ppl.results.residuals import misfit
 from lfm_ppl.results.scalars import unit_of
 from lfm_ppl.results.series import TIMES, select_series, series_dimension, series_labels, times_of
@@ -100,7 +100,8 @@ def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figur
     arviz_data.refuse_several_sites(result)
     attrs = arviz_data.attributes(result)
     table = tables.annotate(arviz_data.summary(result), result)
-    pictures, failures = _draw_figures(result) if figures is None else (_read(figures), [])
+    pictures, failures = _draw_figures(result) if figures is None else (
+        {Path(figure).stem: Path(figure).read_bytes() for figure in figures}, [])
     diagnostics = [name for name in _DIAGNOSTICS if name in table]
     description = str(attrs.get("description", "")).strip()
     has_accuracy = arviz_data.has_group(result, report.GROUP)
@@ -170,17 +171,12 @@ def _draw_figures(result: Any) -> tuple[dict[str, bytes], list[str]]:
     pictures, failures = {}, []
     for name, draw, names in saving.pages_of(result, "full"):
         try:
-            figure = draw(result, names, width="full")
-            with style.in_style(), io.BytesIO() as buffer:
-                figure.savefig(buffer, format="png")
+            with io.BytesIO() as buffer:
+                draw(result, names, width="full").savefig(buffer, format="png")
                 pictures[name] = buffer.getvalue()
         except Exception as error:  # the page is worth having without it
             failures.append(f"The figure {name} could not be drawn: {error}")
     return pictures, failures
-
-
-def _read(figures: Sequence[str | Path]) -> dict[str, bytes]:
-    return {Path(path).stem: Path(path).read_bytes() for path in figures}
 
 
 def _short(table: pd.DataFrame, result: Any) -> pd.DataFrame:

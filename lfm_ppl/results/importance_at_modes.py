@@ -114,9 +114,7 @@ def weighted_posterior(posterior: LogPosterior, y: Any, modes: Sequence[Minimum]
 def _mixture_weights(weight: np.ndarray, log_t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return weights (K,) of the mixture that fits best, by expectation maximisation, and parts of the weights (K, D).
 
-    Args:
-        weight: (D,) of the draws.
-        log_t: (K, D) log densities of the parts of the mixture.
+    The draws have the weights ``weight`` (D,), and under the parts of the mixture the log densities ``log_t`` (K, D).
     """
     mass = np.full(len(log_t), 1.0 / len(log_t))
     for _ in range(_ITERATIONS if len(log_t) > 1 else 1):

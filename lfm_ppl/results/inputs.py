@@ -47,16 +47,9 @@ def input_unit(result: Any, name: str) -> str:
 
 
 def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | None, unit: str) -> dict[str, Any]:
-    """Add the known inputs of data to the groups of a result, and the unit of time where the model does not name it.
+    """Add known inputs, and the unit of time where the model names none, to groups; return attributes of the result.
 
-    Args:
-        groups: of the result.
-        data: with known inputs; None: there are none.
-        origin: calendar time of t = 0; None where times are plain numbers.
-        unit: of time, empty where it is not known.
-
-    Returns:
-        Attributes of the result.
+    ``origin`` is the calendar time of t = 0, None where times are plain numbers.
     """
     if data is not None and data.inputs:
         groups[GROUP] = to_dataset(data.inputs, data.units)

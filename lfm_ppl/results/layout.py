@@ -72,14 +72,10 @@ class Labels:
         series = plate_dimension(bound)
         plates = [frame.name for frame in trace[site.name].get("cond_indep_stack", ())]
         renamed = {plates[0]: series} if series is not None and len(plates) == 1 else {}
-        dimensions: dict[str, tuple[str | None, ...]] = {}
-        derived = set()
         likelihoods = {likelihood.name for likelihood in bound.traced.likelihoods}
-        for name, site_trace in trace.items():
-            if name in likelihoods or site_trace["type"] not in ("sample", "deterministic"):
-                continue
-            derived |= {name} if site_trace["type"] == "deterministic" else set()
-            dimensions[name] = _axes(site_trace, renamed)
+        dimensions = {name: _axes(site_trace, renamed) for name, site_trace in trace.items()
+                      if name not in likelihoods and site_trace["type"] in ("sample", "deterministic")}
+        derived = frozenset(name for name in dimensions if trace[name]["type"] == "deterministic")
         for name, requested_dims in (dims or {}).items():
             names: list[str] = [requested_dims] if isinstance(requested_dims, str) else list(requested_dims)
             if name not in dimensions:
@@ -109,7 +105,7 @@ class Labels:
             if len(values) != sizes[text] or len(set(values)) < len(values):
                 raise ValueError(f"coords: the dimension {text!r} needs {sizes[text]} labels, each of them once; got "
                                  f"{len(values)}: {', '.join(map(str, values))}.")
-        return cls(dimensions, labels, frozenset(derived), series)
+        return cls(dimensions, labels, derived, series)
 
 
 def _axes(site: Mapping[str, Any], renamed: Mapping[str, str]) -> tuple[str | None, ...]:
@@ -144,7 +140,7 @@ class TrajectoryDraws(NamedTuple):
 
 
 def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, trajectories: TrajectoryDraws,
-            truth: Mapping[str, Any] | None, labels: Labels | None = None) -> dict[str, xr.Dataset]:
+            truth: Mapping[str, Any] | None, labels: Labels) -> dict[str, xr.Dataset]:
     """Return the groups of a result.
 
     Args:
@@ -154,9 +150,8 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
         scores: `lfm_ppl.inference.posterior.scores` of all draws, one chain after another; None: no scores.
         trajectories: trajectories at some of the draws.
         truth: truth of simulated data.
-        labels: names of axes; None: the names of the model.
+        labels: names of axes.
     """
-    labels = labels or Labels.of(bound)
     draw_index, paths, grid = trajectories
     site, times, y = bound.site, bound.times, np.asarray(bound.y)
     chains, samples = next(iter(draws.values())).shape[:2]

@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
@@ -79,9 +78,8 @@ class LikelihoodProblem:
         """The same draws with one likelihood site selected, by name of the site."""
         if not self.bound.is_by_site:
             return {self.bound.site.name: self}
-        stores = self.stores
-        return {name: replace(self, bound=bound, stores=None if stores is None else functools.partial(
-            _site_store, stores, name)) for name, bound in self.bound.site_models.items()}
+        return {name: replace(self, bound=bound).rename_stores(suffix=f" of site {name}")
+                for name, bound in self.bound.site_models.items()}
 
     @property
     def size(self) -> int:
@@ -97,9 +95,10 @@ class LikelihoodProblem:
         """Return the same problem with some of the draws."""
         return replace(self, draws={name: value[rows] for name, value in self.draws.items()})
 
-
-def _site_store(stores: Callable[[str], BatchStore], site: str, name: str) -> BatchStore:
-    return stores(f"{name} of site {site}")
+    def rename_stores(self, prefix: str = "", suffix: str = "") -> LikelihoodProblem:
+        """Return the same problem, whose computations are stored under other names."""
+        stores = self.stores
+        return self if stores is None else replace(self, stores=lambda name: stores(f"{prefix}{name}{suffix}"))
 
 
 @dataclass(frozen=True)
@@ -147,9 +146,9 @@ def is_exact(ssm: StateSpaceModel) -> bool:
     return ssm.time_invariant and not is_family and not is_observation_nonlinear(ssm)
 
 
-def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods") -> np.ndarray:
-    """Return (S,): the log likelihoods of the Gaussian filter, summed over the series of a panel."""
-    bound = problem.bound
+def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods", **settings: Any) -> np.ndarray:
+    """Return log likelihoods (S,) of the Gaussian filter, with other settings, summed over the series of a panel."""
+    bound = problem.bound.approximate(**settings) if settings else problem.bound
 
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
         return {"total": bound.likelihood(values, y).log_prob(bound.data(y)).sum()}
@@ -187,12 +186,6 @@ def finer_steps(example: SeriesLikelihood) -> dict[str, Any]:
     if example.tolerance is not None:
         settings["tolerance"] = finer_tolerance(example.tolerance)
     return settings
-
-
-def gaussian_with_finer_steps(problem: LikelihoodProblem) -> np.ndarray:
-    """Return (S,): the log likelihoods of the Gaussian filter with about twice as many integration steps."""
-    finer = problem.bound.approximate(**finer_steps(problem.example))
-    return gaussian(replace(problem, bound=finer), "log likelihoods with finer steps")
 
 
 def on_grid(problem: LikelihoodProblem, settings: ReferenceSettings) -> Reference:
@@ -245,10 +238,8 @@ def by_particles(problem: LikelihoodProblem, settings: ReferenceSettings, noise:
     final_count = count
     if settings.particles is None:
         rows = np.unique(np.linspace(0, problem.size - 1, _PILOT).round().astype(int))
-        stores = problem.stores
-        pilot_stores = None if stores is None else lambda name: stores(f"pilot {name}")
-        pilot = _particle_run(problem, count, settings)
-        sd = noise(pilot(replace(problem.select(rows), stores=pilot_stores), pilot_key))
+        pilot = problem.select(rows).rename_stores(prefix="pilot ")
+        sd = noise(_particle_estimates(pilot, count, settings, pilot_key))
         needed_particles = count * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
         time_grid = build_time_grid(example.ssm, example.times, settings.steps or example.steps, example.max_step)
         steps_made = np.shape(time_grid.intervals.length)[0] * time_grid.steps
@@ -260,7 +251,7 @@ def by_particles(problem: LikelihoodProblem, settings: ReferenceSettings, noise:
         count = max(count, min(final_count, _rounded(_FIRST_WORK / each_particle)))
     while True:
         start_time = time.perf_counter()
-        estimates = _particle_run(problem, count, settings)(problem, key)
+        estimates = _particle_estimates(problem, count, settings, key)
         if count >= final_count or (is_settled is not None and is_settled(estimates)):
             break
         more = min(4 * count, final_count)
@@ -287,7 +278,9 @@ _SAFETY = 1.2
 """Factor on the number of particles of the pilot run, which is an estimate."""
 
 
-def _particle_run(problem: LikelihoodProblem, particles: int, settings: ReferenceSettings) -> Callable:
+def _particle_estimates(problem: LikelihoodProblem, particles: int, settings: ReferenceSettings,
+                        key: jax.Array) -> np.ndarray:
+    """Return estimates (S, B, R) of the likelihoods of each series."""
     example, steps = problem.example, settings.steps
     check_noise(example.ssm, example.time_grid.initial_time)
     filter_settings = particle_filter.check_settings(example.ssm, ParticleSettings(particles))
@@ -314,11 +307,8 @@ def _particle_run(problem: LikelihoodProblem, particles: int, settings: Referenc
         # their averages.
         return jax.lax.map(replicate, jax.random.split(key, settings.replicates)).T
 
-    def run(problem: LikelihoodProblem, key: jax.Array) -> np.ndarray:
-        name = (f"particle filter, {particles:,} particles", filter_settings, settings.replicates, steps)
-        return _map_sequentially(problem, key, name, per_draw, settings.show_progress)
-
-    return run
+    name = (f"particle filter, {particles:,} particles", filter_settings, settings.replicates, steps)
+    return _map_sequentially(problem, key, name, per_draw, settings.show_progress)
 
 
 def _map_sequentially(problem: LikelihoodProblem, key: jax.Array, name: tuple[str, *tuple[Hashable, ...]],
@@ -337,11 +327,6 @@ def _scout_models(problem: LikelihoodProblem) -> list[Any]:
     models = []
     for row in rows:
         parameters = {name: jnp.asarray(value[row]) for name, value in problem.draws.items()}
-        distribution = problem.bound.likelihood(parameters)
-        if isinstance(distribution, Panel):
-            leaves = [jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[b], distribution.parameters)  # noqa: B023
-                      for b in range(problem.series)]
-            models += [distribution.build(leaf) for leaf in leaves]
-        else:
-            models.append(distribution.model)
+        site = problem.bound.site._replace(distribution=problem.bound.likelihood(parameters))
+        models += [member.model for member in site.members]
     return models

@@ -26,12 +26,6 @@ def write(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], path:
           overwrite: bool = False) -> Path:
     """Write each dataset as a group of a netCDF file, atomically, and return its path.
 
-    Args:
-        groups: group name -> dataset.
-        attributes: of the file as a whole.
-        path: the file.
-        overwrite: replace a file that exists.
-
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is False.
     """

@@ -16,7 +16,6 @@ import pandas as pd
 import xarray as xr
 from scipy import special
 
-from lfm_ppl.results import arviz_data
 from lfm_ppl.results.scalars import units_attribute
 from lfm_ppl.results.series import time_coordinate
 
@@ -91,7 +90,9 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], draw_index: 
     clock = time_coordinate("time", times, panel, units)
     coords = {"chain": np.arange(paths["prediction"].shape[0]), "draw": draw_index, **clock}
     coords |= {name: labels[name] for name in panel if name in labels}
-    attrs = {"observed": site.name, "last_observation": float(last_observation(bound.times, np.asarray(bound.y)))}
+    is_observed = np.isfinite(np.asarray(bound.y)).any(axis=-1)
+    observed_times = np.broadcast_to(bound.times, is_observed.shape)[is_observed]
+    attrs = {"observed": site.name, "last_observation": float(np.max(observed_times, initial=-np.inf))}
     return xr.Dataset(variables, {**coords, **{kind: names for kind, names in named.items() if names}}, attrs)
 
 
@@ -101,12 +102,6 @@ def held_out_data(times: np.ndarray, y: np.ndarray, observed: xr.Dataset) -> xr.
     return xr.Dataset({"y": (("time", "output"), y, observed["y"].attrs)}, named)
 
 
-def last_observation(times: np.ndarray, y: np.ndarray) -> float:
-    """Return the time of the last observation that is not missing."""
-    seen = np.isfinite(y).any(axis=-1)
-    return float(np.max(np.broadcast_to(times, seen.shape)[seen], initial=-np.inf))
-
-
 def observed_variable(dataset: xr.Dataset) -> xr.DataArray:
     """Return the new observations of a dataset of predictions."""
     name = dataset.attrs.get("observed", "y")
@@ -114,15 +109,6 @@ def observed_variable(dataset: xr.Dataset) -> xr.DataArray:
         raise ValueError(f"the group {GROUP} has no variable {name!r}; it has "
                          f"{', '.join(map(str, dataset.data_vars))}. Expected what lfm.forecast made.")
     return dataset[name]
-
-
-def of_result(result: Any) -> xr.Dataset:
-    """Return the predictions of a result, or the dataset itself where it is one.
-
-    Raises:
-        ValueError: the result has none; the message says how to get them.
-    """
-    return result if isinstance(result, xr.Dataset) else arviz_data.group(result, GROUP)
 
 
 def summary(dataset: xr.Dataset) -> pd.DataFrame:
@@ -135,15 +121,15 @@ def summary(dataset: xr.Dataset) -> pd.DataFrame:
         Indexed by time; columns output, mean, sd, q2.5, q97.5, noise_free_mean, noise_free_q2.5, noise_free_q97.5.
     """
     rows = []
-    new = _flat(observed_variable(dataset))
+    new = flat_draws(observed_variable(dataset))
     if MEAN in dataset and SD in dataset:
-        mean = _flat(dataset[MEAN])
-        spread = np.sqrt(np.mean(_flat(dataset[SD]) ** 2, axis=0) + mean.var(axis=0))
+        mean = flat_draws(dataset[MEAN])
+        spread = np.sqrt(np.mean(flat_draws(dataset[SD]) ** 2, axis=0) + mean.var(axis=0))
     else:
         mean, spread = new, new.std(axis=0)
     low, high = interval(dataset)
     below, above = noise_free_interval(dataset)
-    free = mean.mean(axis=0) if MEAN in dataset else _flat(dataset["outputs"]).mean(axis=0)
+    free = mean.mean(axis=0) if MEAN in dataset else flat_draws(dataset["outputs"]).mean(axis=0)
     for k, time in enumerate(dataset["time"].values):
         for d, name in enumerate(dataset["output"].values):
             rows.append({"time": time, "output": str(name), "mean": mean[:, k, d].mean(), "sd": spread[k, d],
@@ -155,8 +141,8 @@ def summary(dataset: xr.Dataset) -> pd.DataFrame:
 def interval(dataset: xr.Dataset) -> np.ndarray:
     """Return the ends (2, K, D) of the 95% interval of new data, by their density where it is known."""
     if MEAN in dataset and SD in dataset:
-        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[SD]), INTERVAL)
-    return quantiles(_flat(observed_variable(dataset)), INTERVAL)
+        return mixture_quantiles(flat_draws(dataset[MEAN]), flat_draws(dataset[SD]), INTERVAL)
+    return quantiles(flat_draws(observed_variable(dataset)), INTERVAL)
 
 
 def quantiles(draws: np.ndarray, p: Any) -> np.ndarray:
@@ -177,8 +163,8 @@ def quantiles(draws: np.ndarray, p: Any) -> np.ndarray:
 def noise_free_interval(dataset: xr.Dataset) -> np.ndarray:
     """Return the ends (2, K, D) of the 95% interval of the noise-free outputs, by their density where it is known."""
     if MEAN in dataset and FREE_SD in dataset and bool((dataset[FREE_SD] > 0).any()):
-        return mixture_quantiles(_flat(dataset[MEAN]), _flat(dataset[FREE_SD]), INTERVAL)
-    return np.quantile(_flat(dataset["outputs"]), INTERVAL, axis=0)
+        return mixture_quantiles(flat_draws(dataset[MEAN]), flat_draws(dataset[FREE_SD]), INTERVAL)
+    return np.quantile(flat_draws(dataset["outputs"]), INTERVAL, axis=0)
 
 
 def repeats_often(period: float, span: float) -> bool:
@@ -186,8 +172,9 @@ def repeats_often(period: float, span: float) -> bool:
     return span > 2 * SHOWN_PERIODS * period
 
 
-def _flat(variable: xr.DataArray) -> np.ndarray:
-    variable = variable.transpose("chain", "draw", "time", "output")
+def flat_draws(variable: xr.DataArray) -> np.ndarray:
+    """Return the draws (S, ..., K, D) of all chains, one chain after another."""
+    variable = variable.transpose("chain", "draw", ..., "time", "output")
     return np.asarray(variable.values, float).reshape(-1, *variable.shape[2:])
 
 

@@ -94,7 +94,9 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
     for name, site_model in bound.site_models.items():
         _check_settings(site_model.site, settings.get(name, {}) if settings else attrs)
     bound = bound.fix(json.loads(attrs.get("fixed") or "{}"))
-    return LikelihoodProblem(bound, _latent(bound, posterior))
+    if not bound.sites:
+        raise ValueError("the model has no parameters that are sampled, so there is nothing to check.")
+    return LikelihoodProblem(bound, parameter_draws(bound, posterior))
 
 
 def _missing_keywords(numpyro_model: Callable, arguments: Mapping[str, Any]) -> list[str]:
@@ -134,8 +136,8 @@ def _check_settings(site: LikelihoodSite, attrs: Mapping[str, Any]) -> None:
                              f"{settings[name]}; give the model as it was fitted.")
 
 
-def _latent(bound: BoundModel, posterior: xr.Dataset) -> dict:
-    """Return the draws of the sample sites; deterministic ones the model computes itself."""
+def parameter_draws(bound: BoundModel, posterior: xr.Dataset) -> dict[str, np.ndarray]:
+    """Return the draws (C * N, ...) of the sample sites; deterministic ones the model computes itself."""
     shapes = {name: np.shape(value) for name, value in bound.constrain(np.zeros(bound.size)).items()}
     draws = {}
     for name in bound.sites:
@@ -149,6 +151,4 @@ def _latent(bound: BoundModel, posterior: xr.Dataset) -> dict:
             raise ValueError(f"{name!r} has shape {shapes[name]} in the model and {values.shape[2:]} in the "
                              "result; it is not the model that the result was made with.")
         draws[name] = values.reshape(-1, *values.shape[2:])
-    if not draws:
-        raise ValueError("the model has no parameters that are sampled, so there is nothing to check.")
     return draws

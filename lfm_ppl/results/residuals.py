@@ -3,8 +3,6 @@
 1. Average the standardised residuals over the draws.
 2. Test mean, variance and normality, and whiteness by the Ljung-Box test, output by output.
 3. `misfit` returns one message for each rejection.
-
-Source: Ljung and Box (1978), Biometrika 65.
 """
 
 from __future__ import annotations
@@ -29,9 +27,6 @@ def mean_residuals(result: Any) -> xr.DataArray:
     A residual is e_k = L_k^-1 (y_k - E[y_k | y_1..k-1, theta]), with L_k L_k' the predictive
     covariance, or the randomised quantile residual of an observation family. Where the model holds,
     e_k is independent N(0, 1). NaN stands for a missing value.
-
-    Args:
-        result: with the group one_step_ahead.
 
     Raises:
         ValueError: the group is missing.
@@ -72,15 +67,11 @@ def autocorrelation(residual: np.ndarray, lags: int) -> tuple[np.ndarray, np.nda
 
 
 def ljung_box(residual: np.ndarray, lags: int) -> float:
-    """Return the p-value of the Ljung-Box test of whiteness.
+    """Return the p-value of the Ljung-Box test of whiteness of residuals (T,), NaN where missing.
 
     Q = n (n + 2) sum_h r_h^2 / (n - h) is chi-squared with ``lags`` degrees of freedom for white
     residuals, where r_h = (1 - h / n) rho_h; with gaps the number of pairs replaces n - h.
     Source: Ljung and Box (1978), Biometrika 65(2), eq. 1.2.
-
-    Args:
-        residual: shape (T,), NaN where missing.
-        lags: how many lags to sum.
     """
     rho, pairs = autocorrelation(residual, lags)
     count = np.isfinite(residual).sum()
@@ -93,9 +84,6 @@ def ljung_box(residual: np.ndarray, lags: int) -> float:
 
 def residual_tests(result: Any) -> pd.DataFrame:
     """Return, for each output, whether its residuals look standard normal and white.
-
-    Args:
-        result: with the group one_step_ahead.
 
     Returns:
         One row per output: count, mean, sd, ks_p (Kolmogorov-Smirnov against N(0, 1)), ljung_box_p

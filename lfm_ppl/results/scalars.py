@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 
@@ -127,8 +128,6 @@ def _labels(name: str, variable: xr.DataArray) -> list[str]:
     dims = [dim for dim in variable.dims if dim not in SAMPLE_DIMS]
     if not dims:
         return [name]
-    ticks = [variable[dim].values if dim in variable.coords else np.arange(variable.sizes[dim]) for dim in dims]
-    return [
-        f"{name}[{','.join(str(tick[i]) for tick, i in zip(ticks, index, strict=True))}]"
-        for index in np.ndindex(*(len(tick) for tick in ticks))
-    ]
+    # Without a coordinate, the labels of a dimension are 0, 1, ...
+    ticks = [variable[dim].values for dim in dims]
+    return [f"{name}[{','.join(map(str, entry))}]" for entry in itertools.product(*ticks)]

@@ -3,8 +3,6 @@
 1. Align predictions and measurements in time; dates are counted as in the result.
 2. A prediction is a mixture of normal distributions over the draws, draws alone, or the law of an observation family.
 3. Compute the scores of every measurement, and their means by output.
-
-Source: Gneiting and Raftery (2007), Journal of the American Statistical Association 102.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from scipy.special import logsumexp
 from lfm_ppl.io.data_set import Data, at_origin
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import clock_of
-from lfm_ppl.results.predictions import MEAN, SD, observed_variable, of_result, quantiles
+from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable, quantiles
 from lfm_ppl.utils import calendar_time, checks
 
 ALL = "all"
@@ -102,29 +100,25 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
 
     Source: Gneiting and Raftery (2007), JASA 102; Ferro (2014), QJRMS 140, for the fair estimator.
     """
-    _check_level(level)
-    predicted = of_result(result)
+    if not 0 < level < 1:
+        raise ValueError(f"level must lie between 0 and 1, got {level}.")
+    predicted = result if isinstance(result, xr.Dataset) else arviz_data.group(result, GROUP)
     variable = observed_variable(predicted)
     series = [str(dim) for dim in variable.dims if dim not in ("chain", "draw", "time", "output")]
     outputs = [str(name) for name in variable["output"].values]
     clock = (None, "") if isinstance(result, xr.Dataset) else clock_of(result)
     predicted, y = aligned(predicted, variable, _on_clock(held_out, *clock), series)
-    variable = observed_variable(predicted)
-    order = ("chain", "draw", *series, "time", "output")
-
-    def flat(name: str) -> np.ndarray | None:
-        return None if name not in predicted else _stacked(predicted[name].transpose(*order))
-
+    variable, names = observed_variable(predicted), [str(name) for name in predicted["output"].values]
+    mean, sd = (flat_draws(predicted[name]) if name in predicted else None for name in (MEAN, SD))
     densities = None
     if numpyro_model is not None:
         # A family's law is that of all its outputs, in the model's order; those not held out are missing.
-        columns = [outputs.index(str(name)) for name in predicted["output"].values]
+        columns = [outputs.index(name) for name in names]
         full = np.full((*y.shape[:-1], len(outputs)), np.nan)
         full[..., columns] = y
         densities = _family_densities(result, numpyro_model, predicted, full, inputs, model_kwargs)[..., columns]
-    series_scores = scores(_stacked(variable.transpose(*order)), y, flat(MEAN), flat(SD), level,
-                   _angles(variable, predicted), densities)
-    return table(series_scores, [str(name) for name in predicted["output"].values], level)
+    angular = np.isin(names, json.loads(variable.attrs.get("angular") or "[]"))
+    return table(scores(flat_draws(variable), y, mean, sd, level, angular, densities), names, level)
 
 
 def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd: np.ndarray | None = None,
@@ -140,7 +134,6 @@ def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd:
         angular: (...), which are angles: differences are taken on the circle.
         densities: (S, ...), log densities of ``y`` at each draw, where these are not normal.
     """
-    mean, sd = (None, None) if mean is None or sd is None else (mean, sd)
     if np.any(angular):
         # All angles on the branch centred on the mean direction.
         centre = np.angle(np.exp(1j * draws).mean(axis=0))
@@ -154,21 +147,16 @@ def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd:
     if mean is None or sd is None:
         error = y - draws.mean(axis=0)
         low, high = quantiles(draws, (below, 1.0 - below))
-        covered = np.where(present, (low <= y) & (y <= high), np.nan)
-        log_score = np.full(y.shape, np.nan)
-        if densities is not None:
-            log_score = np.where(present, logsumexp(np.where(present, densities, 0.0), axis=0) - np.log(len(draws)),
-                                 np.nan)
-            _say_where_few(np.where(present, densities, 0.0), present)
-        return Scores(error, crps(draws, y), log_score, covered)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = np.where(sd > 0, (y - mean) / sd, np.where(y == mean, 0.0, np.sign(y - mean) * np.inf))
-        terms = np.where(sd > 0, stats.norm.logpdf(z) - np.log(sd), np.nan)
-    log_score = np.where(present, logsumexp(np.where(present, terms, 0.0), axis=0) - np.log(len(mean)), np.nan)
-    distribution = stats.norm.cdf(z).mean(axis=0)
-    covered = np.where(present, (below <= distribution) & (distribution <= 1.0 - below), np.nan)
-    _say_where_few(np.where(present, terms, 0.0), present)
-    return Scores(y - mean.mean(axis=0), crps(draws, y), log_score, covered)
+        is_covered = (low <= y) & (y <= high)
+    else:
+        error = y - mean.mean(axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = np.where(sd > 0, (y - mean) / sd, np.where(y == mean, 0.0, np.sign(y - mean) * np.inf))
+            densities = np.where(sd > 0, stats.norm.logpdf(z) - np.log(sd), np.nan)
+        distribution = stats.norm.cdf(z).mean(axis=0)
+        is_covered = (below <= distribution) & (distribution <= 1.0 - below)
+    log_score = np.full(y.shape, np.nan) if densities is None else _mixture_log_density(densities, present)
+    return Scores(error, crps(draws, y), log_score, np.where(present, is_covered, np.nan))
 
 
 def _family_densities(result: Any, numpyro_model: Callable, predicted: xr.Dataset, y: np.ndarray,
@@ -182,9 +170,8 @@ def _family_densities(result: Any, numpyro_model: Callable, predicted: xr.Datase
                          "lfm.forecast returned, not its dataset.")
     problem = rebuilding.problem(result, numpyro_model, model_kwargs=rebuilding.keywords(result, inputs, model_kwargs))
     posterior = arviz_data.group(result, "posterior")
-    labels = posterior["draw"].values if "draw" in posterior.coords else np.arange(posterior.sizes["draw"])
-    draw_index = np.searchsorted(labels, predicted["draw"].values)
-    rows = (np.arange(posterior.sizes["chain"])[:, None] * len(labels) + draw_index).ravel()
+    draw_index = np.searchsorted(posterior["draw"].values, predicted["draw"].values)
+    rows = (np.arange(posterior.sizes["chain"])[:, None] * posterior.sizes["draw"] + draw_index).ravel()
     return log_densities(problem.bound, problem.select(rows).draws, predicted, y)
 
 
@@ -267,13 +254,7 @@ def aligned(predicted: xr.Dataset, variable: xr.DataArray, held_out: Any,
 
 
 def _on_clock(held_out: Any, origin: str | None, unit: str) -> Any:
-    """Return held-out data whose dates are counted as in the result.
-
-    Args:
-        held_out: as in `score`.
-        origin: calendar time of t = 0 of the result; None: its times are plain numbers.
-        unit: of its times.
-    """
+    """Return held-out data whose dates are counted from the origin of the result, in its unit of time."""
     if isinstance(held_out, Data) and held_out.origin is not None and origin is not None:
         return at_origin(held_out, origin, unit)
     if isinstance(held_out, xr.DataArray) and "time" in held_out.coords:
@@ -306,17 +287,9 @@ def _rows(predicted: np.ndarray, times: np.ndarray) -> np.ndarray:
     return nearest
 
 
-def _stacked(variable: xr.DataArray) -> np.ndarray:
-    return np.asarray(variable.values, float).reshape(-1, *variable.shape[2:])
-
-
-def _angles(variable: xr.DataArray, predicted: xr.Dataset) -> np.ndarray:
-    names = json.loads(variable.attrs.get("angular") or "[]")
-    return np.isin(predicted["output"].values.astype(str), names)
-
-
-def _say_where_few(terms: np.ndarray, present: np.ndarray) -> None:
-    """Warn where a mixture density at y is that of a few of its parts."""
+def _mixture_log_density(terms: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Return the log density (...) at y of a mixture of draws (S, ...); warn where a few draws make most of it."""
+    terms = np.where(present, terms, 0.0)
     largest = terms.max(axis=0)
     weights = np.exp(terms - np.where(np.isfinite(largest), largest, 0.0))
     squares = (weights**2).sum(axis=0)
@@ -326,9 +299,4 @@ def _say_where_few(terms: np.ndarray, present: np.ndarray) -> None:
         checks.warn(f"the log score of {int(few.sum())} of {int(present.sum())} entries rests on fewer than "
                     f"{min(_FEW, 0.5 * len(terms)):g} draws: they lie between the simulated paths, or far from all. "
                     "Take more draws in lfm.forecast (--draws), or compare by CRPS.")
-
-
-def _check_level(level: float) -> None:
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie between 0 and 1, got {level}.")
-
+    return np.where(present, logsumexp(terms, axis=0) - np.log(len(terms)), np.nan)

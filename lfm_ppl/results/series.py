@@ -63,14 +63,7 @@ def times_of(dataset: xr.Dataset, clock: str = "time") -> xr.DataArray:
 
 
 def time_coordinate(name: str, times: np.ndarray, panel: tuple[str, ...], units: Mapping[str, str]) -> dict[str, Any]:
-    """Return the coordinate of the times along a dimension.
-
-    Args:
-        name: the dimension, "time" or "at".
-        times: (K,), or (B, K) of series that have their own.
-        panel: the dimension of the series; empty for one series.
-        units: name -> unit.
-    """
+    """Return the coordinate of times (K,) along the dimension ``name``, or (B, K) of series that have their own."""
     label, dims = (name, (name,)) if np.ndim(times) == 1 else (TIMES, (*panel, name))
     return {label: (dims, times, units_attribute(["time"], units))}
 

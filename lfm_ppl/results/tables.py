@@ -155,11 +155,7 @@ def annotate(table: pd.DataFrame, result: Any) -> pd.DataFrame:
 def write_csv(frame: pd.DataFrame, path: str | Path, overwrite: bool = False, index_label: str = "parameter") -> Path:
     """Write a table to a CSV file at full precision, atomically, and return the path.
 
-    Args:
-        frame: the table.
-        path: the file.
-        overwrite: replace a file that exists.
-        index_label: header of the first column, which holds the names of the rows.
+    ``index_label`` is the header of the first column, which holds the names of the rows.
 
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is False.

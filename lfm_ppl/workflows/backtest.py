@@ -3,8 +3,6 @@
 1. Fit the model to the data up to an origin, and forecast the next rows; a second fit compiles nothing.
 2. Forecast the same rows by a reference: persistence, or the seasonal-naive forecast.
 3. Score both, move the origin on, and repeat.
-
-Source: Hyndman and Athanasopoulos (2021), Forecasting: Principles and Practice, section 5.10.
 """
 
 from __future__ import annotations
@@ -24,8 +22,9 @@ from lfm_ppl.io.data import as_data
 from lfm_ppl.io.data_set import model_keywords
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
-from lfm_ppl.results.predictions import GROUP, MEAN, SD, observed_variable
-from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary
+from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable
+from lfm_ppl.results.rebuilding import parameter_draws
+from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary, table
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.types import Times
 from lfm_ppl.workflows.data_binding import bind_dates
@@ -183,9 +182,9 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
                 predicted = arviz_data.group(result, GROUP).isel(time=future)
             except Exception as error:
                 raise type(error)(f"at the origin {times[origin]:g} (row {origin}): {error}") from error
-            draws_of_y = _flat(observed_variable(predicted))
+            draws_of_y = flat_draws(observed_variable(predicted))
             # An observation family has no normal distribution at each draw.
-            mean, sd = (_flat(predicted[name]) if name in predicted else None for name in (MEAN, SD))
+            mean, sd = (flat_draws(predicted[name]) if name in predicted else None for name in (MEAN, SD))
             densities = None if mean is not None else _of_family(bound, result, predicted, y[future])
             origin_scores = scores(draws_of_y, y[future], mean, sd, level, angular, densities)
         messages += [f"origin {times[origin]:g}: {warning.message}" for warning in caught]
@@ -206,9 +205,7 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
 def _of_family(bound: BoundModel, result: Any, predicted: xr.Dataset, y: np.ndarray) -> np.ndarray:
     """Return the log densities (S, H, D) of an observation family along the predicted paths."""
     posterior = arviz_data.group(result, "posterior").isel(draw=predicted["draw"].values)
-    draws = {site: posterior[site.replace("/", ".")].transpose("chain", "draw", ...).values for site in bound.sites}
-    flat = {site: value.reshape(-1, *value.shape[2:]) for site, value in draws.items()}
-    return log_densities(bound, flat, predicted, y)
+    return log_densities(bound, parameter_draws(bound, posterior), predicted, y)
 
 
 def _origins(rows: int, horizon: int, stride: int, first: int | None) -> list[int]:
@@ -248,11 +245,6 @@ def _wrapped(angle: np.ndarray) -> np.ndarray:
     return np.angle(np.exp(1j * angle))
 
 
-def _flat(variable: xr.DataArray) -> np.ndarray:
-    variable = variable.transpose("chain", "draw", "time", "output")
-    return np.asarray(variable.values, float).reshape(-1, *variable.shape[2:])
-
-
 def _dataset(forecasters: tuple, reference: str, times: np.ndarray, origins: list[int], horizon: int,
              outputs: Sequence[str]) -> xr.Dataset:
     dims = ("forecaster", "origin", "horizon", "output")
@@ -276,11 +268,6 @@ def _by_origin(dataset: xr.Dataset) -> pd.DataFrame:
 
 def _table(dataset: xr.Dataset, level: float) -> pd.DataFrame:
     outputs = [str(name) for name in dataset["output"].values]
-    rows = {}
-    for index, forecaster in enumerate(dataset["forecaster"].values):
-        picked = dataset.isel(forecaster=index)
-        for name in [*outputs, ALL]:
-            selected = picked if name == ALL else picked.sel(output=name)
-            rows[(str(forecaster), name)] = summary(_scores_of(selected), level)
-    table = pd.DataFrame.from_dict(rows, orient="index")
-    return table.set_index(pd.MultiIndex.from_tuples(rows, names=["forecaster", "output"]))
+    tables = {str(forecaster): table(_scores_of(dataset.sel(forecaster=forecaster)), outputs, level)
+              for forecaster in dataset["forecaster"].values}
+    return pd.concat(tables, names=["forecaster", "output"])

@@ -184,9 +184,9 @@ def check_requested_times(bound: BoundModel, times: Any, name: str = "at") -> No
     data_times = bound.times if has_series_times else [bound.times]
     rows = times if np.ndim(times) == 2 else [times] * len(data_times)
     members = bound.site.members if has_series_times else [example]
-    for series, (member, *pair) in enumerate(zip(members, data_times, rows, strict=True)):
+    for series, (member, observed, requested) in enumerate(zip(members, data_times, rows, strict=True)):
         try:
-            build_time_grid(member.ssm, pair[0], member.steps, member.max_step, pair[1], tolerance=member.tolerance)
+            build_time_grid(member.ssm, observed, member.steps, member.max_step, requested, tolerance=member.tolerance)
         except ValueError as error:
             raise ValueError(f"series {series}: {error}" if has_series_times else str(error)) from None
 

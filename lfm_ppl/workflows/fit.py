@@ -64,6 +64,7 @@ from lfm_ppl.workflows.fit_options import (
     model_docstring,
 )
 from lfm_ppl.workflows.fit_results import (
+    ConvergenceWarning,
     FitProblem,
     PosteriorDraws,
     PostProcessing,
@@ -72,7 +73,6 @@ from lfm_ppl.workflows.fit_results import (
     build_result,
     note_warnings,
     post_process,
-    warn_of_convergence,
     write_result,
 )
 from lfm_ppl.workflows.fit_starts import FALLBACK, check_init, find_start
@@ -284,7 +284,7 @@ def fit(
         store = checkpoints.begin_or_resume(checkpoint, record, resume)
     if progress:
         print(f"likelihood: {description['likelihood']}", file=sys.stderr, flush=True)
-    with checkpoints.closing(store), calendar_time.in_messages(*clock):
+    with contextlib.closing(store) if store else contextlib.nullcontext(), calendar_time.in_messages(*clock):
         with _explain_start_failure(bound):
             draws = (_draw_about_mode if sampler == "map" else _sample)(problem, store, progress)
         processed = post_process(problem, draws, store, progress)
@@ -303,7 +303,8 @@ def fit(
         warnings.warn(f"the run was stopped, and its result is partial: {partial}.", stacklevel=2)
     for message in processed.warnings:
         checks.warn(message, ApproximationWarning)
-    warn_of_convergence(convergence_warnings)
+    for message in convergence_warnings:
+        checks.warn(message, ConvergenceWarning)
     return result
 
 

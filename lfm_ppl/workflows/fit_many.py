@@ -233,8 +233,7 @@ def fit_many(
         raise ValueError("data_sets is empty; expected at least one pair of a name and (times, y).")
     each, names = dict(each or {}), dict(pairs)
     for name in each:
-        if name not in names:
-            raise ValueError(checks.unknown("data set in each", name, names))
+        checks.one_of("data set in each", name, names)
         _check_options(f"each[{name!r}]", each[name], [*shared, "truth", "name"])
     tasks: dict[str, Task] = {}
     digests: dict[Any, str] = {}

@@ -38,7 +38,6 @@ from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, TrajectoryDraws, force_periods, lay_out
 from lfm_ppl.results.predictions import SHOWN_PERIODS, repeats_often
 from lfm_ppl.results.sites import merge_sites
-from lfm_ppl.utils import checks
 from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
 from lfm_ppl.workflows.fit_options import FitOptions, versions
@@ -312,15 +311,7 @@ def build_result(problem: FitProblem, draws: PosteriorDraws, processed: PostProc
 def lay_out_sites(bound: BoundModel, sites: Mapping[str, SiteProblem], values: dict[str, np.ndarray],
                   statistics: dict[str, np.ndarray],
                   processed: PostProcessing) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the groups of a result, and its attributes on the sites.
-
-    Args:
-        bound: the model with its data.
-        sites: its likelihood sites by name.
-        values: site -> draws (C, N, ...).
-        statistics: statistic of the sampler -> (C, N).
-        processed: scores and trajectories by site.
-    """
+    """Return groups and site attributes of a result; ``values`` and ``statistics`` are those of `PosteriorDraws`."""
     groups: dict[str, dict[str, Any]] = {}
     attributes: dict[str, Any] = {}
     for name, site in sites.items():
@@ -357,9 +348,3 @@ def note_warnings(result: Any, likelihood_warnings: Sequence[str] = ()) -> list[
     convergence_warnings = arviz_data.convergence_warnings(result)
     result.attrs["warnings"] = json.dumps([*convergence_warnings, *likelihood_warnings])
     return convergence_warnings
-
-
-def warn_of_convergence(messages: Sequence[str]) -> None:
-    """Raise each message as a `ConvergenceWarning`."""
-    for message in messages:
-        checks.warn(message, ConvergenceWarning)

@@ -66,13 +66,7 @@ class ChainStart:
 
 
 def find_start(bound: BoundModel, options: FitOptions, setup: Mapping[str, Any] | None) -> ChainStart:
-    """Return the sampler and the starting points.
-
-    Args:
-        bound: the model and its data.
-        options: of the fit.
-        setup: that of the run which is resumed; None: a new run.
-    """
+    """Return the sampler and the starting points; ``setup`` is that of a run which is resumed, None for a new run."""
     check_init(options.init)
     find = _find_nuts_start if options.sampler == "nuts" else _find_random_walk_start
     return find(bound, options, setup)

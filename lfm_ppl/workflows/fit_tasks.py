@@ -38,15 +38,9 @@ def seed_of(name: str, seed: int = 0) -> int:
 
 def fit_task(model: Callable, name: str, value: Any, options: dict[str, Any], seed: int,
              digests: dict[Any, str]) -> Task:
-    """Return the task of one data set.
+    """Return the task of one data set, ``(times, y)`` or `lfm.Data`.
 
-    Args:
-        model: the model.
-        name: name of the data set.
-        value: ``(times, y)`` or `lfm.Data`.
-        options: arguments of `fit`.
-        seed: seed of the run.
-        digests: digests of the model for other data sets, which are extended here.
+    ``options`` are arguments of `fit`, ``digests`` those of the model for other data sets, which are extended here.
     """
     keywords = options.get("model_kwargs") or {}
     if isinstance(value, Data):

@@ -147,11 +147,10 @@ def _forecast(key: jax.Array, result: Any, problem: LikelihoodProblem, times: np
     if log_likelihood is not None and not bound.site.example.is_family:
         total = log_likelihood.reshape(chains, len(draw_index), -1).sum(axis=-1)
         rebuilding.check_likelihood(result, total, draw_index)
-    labels = posterior["draw"].values[draw_index] if "draw" in posterior.coords else draw_index
     observed = arviz_data.group(result, "observed_data")
     series = series_dimension(result)
     names = {str(name): observed[name].values.tolist() for name in ("output", series) if name in observed.coords}
-    groups = {GROUP: predictions(bound, split, labels, times, names, series)}
+    groups = {GROUP: predictions(bound, split, posterior["draw"].values[draw_index], times, names, series)}
     if continued := {name: InputTable(*value) if isinstance(value, tuple) else InputTable(
             np.asarray(value.times), np.asarray(value.values), value.interpolation)
                      for name, value in (inputs or {}).items() if isinstance(value, Input | tuple)}:

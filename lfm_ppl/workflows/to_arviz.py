@@ -27,13 +27,13 @@ from lfm_ppl.utils.types import Result
 from lfm_ppl.workflows.data_binding import check_requested_times, coords_of_site, of_site
 from lfm_ppl.workflows.fit_options import likelihood_settings, model_docstring, versions
 from lfm_ppl.workflows.fit_results import (
+    ConvergenceWarning,
     PostProcessing,
     SiteProblem,
     best_effort,
     draw_paths,
     lay_out_sites,
     note_warnings,
-    warn_of_convergence,
 )
 
 _STATISTICS = {"diverging": "diverging", "accept_prob": "acceptance_rate", "num_steps": "n_steps", "energy": "energy",
@@ -130,7 +130,8 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: ArrayLike, y: ArrayLike,
     if kernel is not None:
         attrs |= {"warmup": int(mcmc.num_warmup), "thin": int(mcmc.thinning)}
     result = arviz_data.build(groups, {label: value for label, value in attrs.items() if value is not None})
-    warn_of_convergence(note_warnings(result))
+    for message in note_warnings(result):
+        checks.warn(message, ConvergenceWarning)
     return result
 
 

@@ -202,7 +202,7 @@ def test_rhat_by_hand():
 
     # Vehtari et al. (2021): the larger one of rank-normalised and folded split R-hat.
     expected = max(rank_normalised(halves), rank_normalised(np.abs(halves - np.median(halves))))
-    np.testing.assert_allclose(arviz_data.rhat(draws_only(draws))["theta"], expected, rtol=1e-6)
+    np.testing.assert_allclose(arviz_data.summary(draws_only(draws)).loc["theta", "r_hat"], expected, rtol=1e-6)
 
 
 def test_diagnostics_that_do_not_exist_are_nan_without_messages(caplog):

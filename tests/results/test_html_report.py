@@ -192,14 +192,15 @@ def test_only_a_page_of_lfm_ppl_is_replaced(groups, attrs, tmp_path, capsys, mon
     before = path.read_bytes()
     with pytest.raises(FileExistsError, match=r"report\.html"):
         save(groups, attrs, path)
-    assert cli_page.save(result, tmp_path, False, ()) == 1 and "report.html" in capsys.readouterr().err
+    assert cli_page.report_failure(lambda: html_report.save_report(result, path, figures=())) == 1
+    assert "report.html" in capsys.readouterr().err
     assert path.read_bytes() == before
-    cli_page.refuse_foreign(tmp_path, False)
+    html_report.refuse_foreign(path, False)
     path.write_text("<html><p>my diary</p></html>")
     with pytest.raises(FileExistsError, match=r"report\.html"):
-        cli_page.refuse_foreign(tmp_path, False)
-    cli_page.refuse_foreign(tmp_path, True)
-    assert cli_page.save(result, tmp_path, True, ()) == 0
+        html_report.refuse_foreign(path, False)
+    html_report.refuse_foreign(path, True)
+    assert cli_page.report_failure(lambda: html_report.save_report(result, path, True, figures=())) == 0
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
     def fail(*arguments, **keywords):

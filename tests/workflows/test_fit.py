@@ -215,7 +215,7 @@ def test_loo_equals_refitting_without_each_observation(line, y, density):
     pointwise = np.asarray(result.loo_i if hasattr(result, "loo_i") else result.elpd_i)
     # Standard error of the log of an importance-sampling mean of 1 / p(y_k | y_-k, theta), at the effective sample size
     inverse = np.exp(-group(line, "log_likelihood")["y"].values.reshape(4000, -1))
-    size = arviz_data.ess(line)["decay"]
+    size = arviz_data.summary(line).loc["decay", "ess_bulk"]
     error = inverse.std(0) / inverse.mean(0) / np.sqrt(size)
     np.testing.assert_array_less(np.abs(pointwise - exact), 4.5 * error + 1e-6)
     total = float(result.elpd_loo if hasattr(result, "elpd_loo") else result.elpd)
@@ -230,7 +230,7 @@ def test_ram_posterior_on_a_line(line, y, density):
     values = prior + log_likelihood(y) - np.log(0.5)
     weights = np.exp(values - values.max())
     weights /= weights.sum()
-    mean, size = weights @ nodes, arviz_data.ess(line)["decay"]
+    mean, size = weights @ nodes, arviz_data.summary(line).loc["decay", "ess_bulk"]
     sd = np.sqrt(weights @ (nodes - mean) ** 2)
     drawn = (np.log(group(line, "posterior")["decay"].values) - np.log(0.5)) / 0.5
     assert abs(drawn.mean() - mean) < 4.5 * sd / np.sqrt(size)

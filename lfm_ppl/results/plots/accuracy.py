@@ -64,8 +64,10 @@ def plot_accuracy(result: Any, parameters: Sequence[str] | None = None, *, width
     _draw_ratios(panels[0], report)
     checked_columns = np.searchsorted(group(result, "posterior")["draw"].values, report.dataset["draw"].values)
     weight = np.exp(report.log_weight).ravel()
+    line = {"ls": "-", "label": "corrected posterior"} if report.reliable else {
+        "ls": (0, (2.5, 1.2)), "label": "corrected posterior, not reliable"}
     for axes, label in zip(panels[1:], labels, strict=False):
-        _draw_densities(axes, draws[label], draws[label][:, checked_columns].ravel(), weight, _line(report))
+        _draw_densities(axes, draws[label], draws[label][:, checked_columns].ravel(), weight, line)
         if label in table.index and report.reliable:
             _mark_means(axes, table.loc[label, "mean"], table.loc[label, "corrected_mean"])
         if label in truth:
@@ -75,12 +77,6 @@ def plot_accuracy(result: Any, parameters: Sequence[str] | None = None, *, width
     style.legend_above(figure)
     style.note_below(figure, f"{_explanation(report)} {note}")
     return figure
-
-
-def _line(report: AccuracyReport) -> dict[str, Any]:
-    """Return how to draw the corrected density."""
-    label = "corrected posterior" + ("" if report.reliable else ", not reliable")
-    return {"color": style.VERMILLION, "lw": 1.1, "ls": "-" if report.reliable else (0, (2.5, 1.2)), "label": label}
 
 
 def _draw_ratios(axes: Axes, report: AccuracyReport) -> None:
@@ -111,7 +107,7 @@ def _draw_densities(axes: Axes, values: np.ndarray, subset: np.ndarray, weight: 
     equal = np.full(subset.size, 1.0 / subset.size)
     change = _density(grid, subset, weight, support, width) - _density(grid, subset, equal, support, width)
     axes.fill_between(grid, density, color=style.SKY, alpha=0.5, lw=0, label="posterior of the filter")
-    axes.plot(grid, np.maximum(density + change, 0.0), **line)
+    axes.plot(grid, np.maximum(density + change, 0.0), color=style.VERMILLION, lw=1.1, **line)
     axes.set_ylim(0.0, None)
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
@@ -134,10 +130,7 @@ def _bandwidth(values: np.ndarray, weight: np.ndarray, grid: np.ndarray) -> floa
 
 def _density(grid: np.ndarray, values: np.ndarray, weight: np.ndarray, support: tuple[float, float],
              bandwidth: float | None = None) -> np.ndarray:
-    """Return a Gaussian kernel density estimate that is reflected at both ends, so that it keeps its mass in between.
-
-    Source: Silverman (1986), Density Estimation, section 2.10.
-    """
+    """Return a Gaussian kernel density estimate, reflected at both ends so that it keeps its mass in between."""
     bandwidth = bandwidth or _bandwidth(values, weight, grid)
     total = np.zeros_like(grid)
     for points in (grid, 2.0 * support[0] - grid, 2.0 * support[1] - grid):

@@ -58,8 +58,7 @@ def plot_calibration(calibration: Calibration, parameters: Sequence[str] | None 
             axes.set_xlabel(f"rank among {calibration.draws} draws")
     figure.supylabel("data sets", fontsize=7.5)
     style.legend_above(figure)
-    if note:
-        style.note_below(figure, note)
+    style.note_below(figure, note)
     return figure
 
 

@@ -2,8 +2,6 @@
 
 1. Left, every draw in its order, with divergences marked.
 2. Right, the ranks of the draws of each chain among all draws, one histogram above the other.
-
-Source: Vehtari et al. (2021), Bayesian Analysis 16.
 """
 
 from __future__ import annotations
@@ -66,17 +64,15 @@ def plot_trace(result: Any, parameters: Sequence[str] | None = None, *, width: s
         trace.set_title(style.with_unit(label, unit, 40))
     rows[-1, 0].set_xlabel("draw")
     rows[-1, 1].set_xlabel("rank")
-    handles = [
-        Line2D([], [], color=colour, lw=1.4, label=f"chain {chain}")
-        for chain, colour in enumerate(_colours(len(next(iter(draws.values())))))
-    ][: len(style.CHAIN_COLOURS)]
+    chains = min(len(next(iter(draws.values()))), len(style.CHAIN_COLOURS))
+    handles = [Line2D([], [], color=colour, lw=1.4, label=f"chain {chain}")
+               for chain, colour in enumerate(_colours(chains))]
     if any(label in truth for label in labels):
         handles.append(Line2D([], [], **style.TRUTH))
     if diverging.any():
         handles.append(Line2D([], [], ls="", label="divergent", **_DIVERGENT))
     style.legend_above(figure, handles)
-    if note:
-        style.note_below(figure, note)
+    style.note_below(figure, note)
     return figure
 
 
@@ -87,10 +83,8 @@ def parameters_to_draw(result: Any, names: Sequence[str] | None,
     draws = scalar_draws(posterior)
     selected = sampled(posterior) if names is None else choose(draws, names)
     if not selected:
-        raise ValueError(
-            "no parameter varies in the posterior, so there is nothing to draw; "
-            f"known: {', '.join(draws) or 'none'}."
-        )
+        raise ValueError("no parameter varies in the posterior, so there is nothing to draw; known: "
+                         f"{', '.join(draws) or 'none'}.")
     return draws, *style.first_of(selected, names, limit, "parameters")
 
 

@@ -106,10 +106,7 @@ def draw_held_out(axes: Axes, result: Any, name: str) -> None:
 def draw_outputs(axes: Axes, predicted: xr.Dataset, start: tuple[float, ...] = ()) -> None:
     """Draw predictions of one output, noise-free and new data.
 
-    Args:
-        axes: the panel.
-        predicted: predictions of one output.
-        start: time, mean and ends of both bands from which the predictions continue; empty where nothing comes before.
+    They continue from ``start``, time, mean and ends of both bands; empty where nothing comes before.
     """
     if predicted.sizes["time"] == 0:
         return

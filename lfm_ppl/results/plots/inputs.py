@@ -13,7 +13,7 @@ from lfm_ppl.io.data_set import InputTable
 from lfm_ppl.results.inputs import FORECAST, input_unit, inputs_of
 from lfm_ppl.results.plots import forecasts, style
 from lfm_ppl.results.plots.trajectories import MAX_PANELS, finish
-from lfm_ppl.utils.checks import unknown
+from lfm_ppl.utils.checks import one_of
 
 _MANY = 150  # values, from which they have no marks
 
@@ -50,8 +50,7 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
                          "lfm.Data(..., inputs=...).")
     selected = list(tables) if inputs is None else [inputs] if isinstance(inputs, str) else list(inputs)
     for name in selected:
-        if name not in tables:
-            raise ValueError(unknown("input", name, list(tables)))
+        one_of("input", name, tables)
     names, note = style.first_of(selected, inputs, MAX_PANELS, "inputs")
     figure, panels = style.small_multiples(width, len(names), 1.25)
     _, end = forecasts.forecast_span(result)

@@ -53,10 +53,8 @@ def plot_pairs(result: Any, parameters: Sequence[str] | None = None, *, width: s
     draws, labels, note = parameters_to_draw(result, parameters, limit)
     count = len(labels)
     if count > limit:
-        raise ValueError(
-            f"{count} parameters do not fit into {style.inches(width):g} inches; name at most "
-            f"{limit}, or pass width={math.ceil(count * _SMALLEST + _MARGIN)}."
-        )
+        raise ValueError(f"{count} parameters do not fit into {style.inches(width):g} inches; name at most {limit}, or "
+                         f"pass width={math.ceil(count * _SMALLEST + _MARGIN)}.")
     truth, units = known_truth(result), parameter_units(result)
     diverging = divergences(result).ravel()
     flat = [draws[label].ravel() for label in labels]
@@ -83,8 +81,7 @@ def plot_pairs(result: Any, parameters: Sequence[str] | None = None, *, width: s
         _write_above(grid[index, index], f"{label} ({unit})" if unit else label, float(2 * index >= count))
     if diverging.any() or any(label in truth for label in labels):
         style.legend_above(figure)
-    if note:
-        style.note_below(figure, note)
+    style.note_below(figure, note)
     return figure
 
 
@@ -104,13 +101,8 @@ def _draw_marginal(axes: Axes, values: np.ndarray, truth: float | None) -> None:
         axes.axvline(truth, **style.TRUTH)
 
 
-def _draw_pair(
-    axes: Axes,
-    x: np.ndarray,
-    y: np.ndarray,
-    diverging: np.ndarray,
-    truth: tuple[float | None, float | None],
-) -> None:
+def _draw_pair(axes: Axes, x: np.ndarray, y: np.ndarray, diverging: np.ndarray,
+               truth: tuple[float | None, float | None]) -> None:
     # Evenly thinned draws look like all of them; divergences are rare and are all drawn.
     thinned = slice(None, None, -(-x.size // MAX_POINTS))
     axes.plot(x[thinned], y[thinned], color=style.BLUE, ls="", marker="o", ms=1.6, mew=0, alpha=0.35, rasterized=True,

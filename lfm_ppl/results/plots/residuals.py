@@ -23,13 +23,7 @@ from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.plots.trajectories import finish, pick, series_views
-from lfm_ppl.results.residuals import (
-    autocorrelation,
-    default_lags,
-    mean_residuals,
-    normal_scores,
-    residual_tests,
-)
+from lfm_ppl.results.residuals import autocorrelation, default_lags, mean_residuals, normal_scores, residual_tests
 
 MAX_OUTPUTS = 4
 _ENVELOPE = "#DDDDDD"
@@ -70,7 +64,7 @@ def plot_residuals(result: Any, outputs: Sequence[str] | None = None, *, series:
     residual = group(result, "one_step_ahead")["residual"]
     names, note = style.first_of(pick(residual, "output", outputs), outputs, MAX_OUTPUTS, "outputs")
     views, remark = series_views(result, series, len(names))
-    note = f"{remark} {note}".strip()
+    note = f"{remark} {note}"
     if len(views) > 1:
         return _draw_series(views, names, note, width)
     ((title, result),) = views.items()
@@ -88,8 +82,7 @@ def plot_residuals(result: Any, outputs: Sequence[str] | None = None, *, series:
         row[1].set_xlabel("normal quantile")
         row[2].set_xlabel("lag (observations)")
     style.legend_above(figure)
-    if note:
-        style.note_below(figure, note)
+    style.note_below(figure, note)
     return figure
 
 

@@ -27,14 +27,8 @@ _OVER_TIME: dict[str, Draw] = {
 }
 
 
-def save_figures(
-    result: Any,
-    folder: str | Path,
-    formats: Sequence[str] = ("png",),
-    *,
-    width: str | float = "full",
-    overwrite: bool = False,
-) -> list[Path]:
+def save_figures(result: Any, folder: str | Path, formats: Sequence[str] = ("png",), *, width: str | float = "full",
+                 overwrite: bool = False) -> list[Path]:
     """Draw every figure that ``result`` has the groups for, and write it to ``folder``.
 
     The figures are fit, inputs, forces, deterministics, states, fields, trace (not of sampler "map", which has no
@@ -146,10 +140,7 @@ def _pages(title: str, draw: Draw, names: list[str], size: int,
 def _numbered(title: str, draw: Draw, names: Sequence[Any], size: int) -> Iterator[tuple[str, Draw, list[Any]]]:
     pages = [list(names[start:start + size]) for start in range(0, len(names), size)]
     if len(pages) > MAX_PAGES:
-        warnings.warn(
-            f"{title}: drawing the first {MAX_PAGES * size} of {len(names)}; call "
-            f"{draw.__name__} with names for the others.",
-            stacklevel=4,
-        )
+        warnings.warn(f"{title}: drawing the first {MAX_PAGES * size} of {len(names)}; call {draw.__name__} with names "
+                      "for the others.", stacklevel=4)
     for number, page in enumerate(pages[:MAX_PAGES], start=1):
         yield (f"{title}-{number}" if len(pages) > 1 else title), draw, page

@@ -110,10 +110,7 @@ def inches(width: str | float) -> float:
     """Return the width of a figure in inches: of "column", "full", or a number of inches."""
     if isinstance(width, str):
         if width not in WIDTHS:
-            raise ValueError(
-                f"width must be {' or '.join(map(repr, WIDTHS))} or a number of inches, "
-                f"got {width!r}."
-            )
+            raise ValueError(f"width must be {' or '.join(map(repr, WIDTHS))} or a number of inches, got {width!r}.")
         return WIDTHS[width]
     if not (math.isfinite(width) and width >= 2.0):
         raise ValueError(f"width must be at least 2 inches, got {width!r}.")
@@ -317,9 +314,9 @@ def legend_above(figure: Figure, handles: Sequence[Any] = ()) -> None:
 
 
 def note_below(figure: Figure, text: str) -> None:
-    """Write a remark under ``figure``."""
-    lines = textwrap.wrap(text, int(figure.get_figwidth() * 17))
-    figure.supxlabel("\n".join(lines), fontsize=SMALL, color=GREY)
+    """Write a remark under ``figure``, if there is one."""
+    if lines := textwrap.wrap(text, int(figure.get_figwidth() * 17)):
+        figure.supxlabel("\n".join(lines), fontsize=SMALL, color=GREY)
 
 
 def with_unit(name: str, unit: str, room: int = _ROOM) -> str:
@@ -345,6 +342,4 @@ def first_of(names: Sequence[str], selection: Sequence[str] | None, limit: int, 
     """
     if selection is not None or len(names) <= limit:
         return list(names), ""
-    return list(names[:limit]), (
-        f"The first {limit} of {len(names)} {argument}; choose others with {argument}=[...]."
-    )
+    return list(names[:limit]), f"The first {limit} of {len(names)} {argument}; choose others with {argument}=[...]."

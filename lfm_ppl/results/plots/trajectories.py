@@ -24,7 +24,7 @@ from lfm_ppl.results.plots import forecasts, style
 from lfm_ppl.results.predictions import INTERVAL, PERIODS, REGIMES, SHOWN_PERIODS, quantiles, repeats_often
 from lfm_ppl.results.scalars import unit_of
 from lfm_ppl.results.series import select_series, series_dimension, series_labels
-from lfm_ppl.utils.checks import unknown
+from lfm_ppl.utils.checks import one_of
 
 MAX_PANELS = 12
 _MANY = 150  # measurements
@@ -192,8 +192,7 @@ def pick(variable: xr.DataArray, kind: str, selection: Sequence[str] | None) -> 
         return available
     selection = [selection] if isinstance(selection, str) else list(selection)
     for name in selection:
-        if name not in available:
-            raise ValueError(unknown(kind, name, available))
+        one_of(kind, name, available)
     if not selection:
         raise ValueError(f"{kind}s is empty; name at least one of {', '.join(available)}.")
     return selection
@@ -298,18 +297,15 @@ def finish(figure: Figure, panels: list[Axes], result: Any, remark: str) -> None
     style.label_time(panels, time_unit(result), time_origin(result))
     figure.align_ylabels(panels)
     style.legend_above(figure)
-    if remark.strip():
-        style.note_below(figure, remark)
+    style.note_below(figure, remark)
 
 
 def _trajectories(result: Any, kind: str) -> xr.DataArray:
     dataset = group(result, "trajectories")
     if f"{kind}s" not in dataset or dataset.sizes[kind] == 0:
-        raise ValueError(
-            f"the result holds no {kind} trajectories; its group trajectories has "
-            f"{', '.join(map(str, dataset.data_vars))}. They come from lfm.fit with "
-            f"trajectory_draws above zero, for a model that has {kind}s."
-        )
+        raise ValueError(f"the result holds no {kind} trajectories; its group trajectories has "
+                         f"{', '.join(map(str, dataset.data_vars))}. They come from lfm.fit with trajectory_draws "
+                         f"above zero, for a model that has {kind}s.")
     return dataset[f"{kind}s"].transpose("chain", "draw", ..., "at", kind)
 
 
