@@ -4,6 +4,8 @@
 2. One forward scan predicts and updates (`lfm_ppl.filtering.forward`); an observation family is filtered by assumed
    density filtering.
 3. The last moments are a `FilterState`, from which a later call continues.
+
+Source: Särkkä and Sarmavuori (2013), Signal Processing 93.
 """
 
 from __future__ import annotations

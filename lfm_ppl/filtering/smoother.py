@@ -4,6 +4,8 @@
 2. The model is linearised about the filter's moments, about iterated posterior moments, or about the moments that
    the sites of an observation family give.
 3. One forward and one backward scan give the smoothed moments at all nodes; draws come from the same forward scan.
+
+Source: Särkkä and Sarmavuori (2013), Signal Processing 93.
 """
 
 from __future__ import annotations
@@ -197,8 +199,8 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         >>> lfm.smooth(model, jnp.arange(3.0), jnp.ones((3, 1)), at=jnp.linspace(0, 4, 5)).force("u").mean.shape
         (5,)
 
-    Source: Särkkä and Sarmavuori (2013), Signal Processing 93; García-Fernández, Svensson and Särkkä (2017) for the
-    iterations; de Jong (1989), Biometrika 76, for the leave-one-out conditionals.
+    Source: Särkkä and Sarmavuori (2013); García-Fernández, Svensson and Särkkä (2017) for the iterations;
+    de Jong (1989), Biometrika 76, for the leave-one-out conditionals.
     """
     rule = as_rule(rule)
     checks.one_of("method", method, METHODS)

@@ -5,6 +5,8 @@
 3. Decompose the Hessian there: the covariance is its inverse, and flat directions are reported.
 4. Report why the point is not a minimum: derivatives that are not finite, a saddle point, a coordinate that runs away,
    or a remaining slope.
+
+Source: Tierney and Kadane (1986), Journal of the American Statistical Association 81, 82-86.
 """
 
 from __future__ import annotations

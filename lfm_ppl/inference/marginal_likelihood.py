@@ -6,6 +6,8 @@
    the log evidence of the converged sites (`lfm_ppl.filtering.ep`).
 3. Constraints: `ConstrainedLikelihood`.
 4. A failure inside compiled code is a log density of -inf with zero gradients; outside of it a warning names the row.
+
+Source: Hartikainen et al. (2012), section 4; Singer (2011), AStA 95.
 """
 
 from __future__ import annotations

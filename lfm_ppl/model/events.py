@@ -5,6 +5,8 @@ r"""Events: known times at which the physical state jumps.
 3. Each event is an affine map ``x <- keep * x + offset``, entry by entry (`StateMap`), and so exact for a Gaussian, a
    particle and a trajectory alike.
 4. The time grid ends an interval at the time of each event (`EventTable`).
+
+Source: Rowland and Tozer (2011), Clinical Pharmacokinetics and Pharmacodynamics, chapter 11, for repeated doses.
 """
 
 from __future__ import annotations
@@ -110,7 +112,7 @@ class Dose(Event):
         >>> round(float(result.predicted_mean[1, 1]), 2)
         1.9
 
-    Source: Rowland and Tozer (2011), Clinical Pharmacokinetics and Pharmacodynamics, chapter 11.
+    Source: Rowland and Tozer (2011), chapter 11.
     """
 
     def __init__(self, times: ArrayLike, amounts: ArrayLike, target: Any, lag: ArrayLike = 0.0,

@@ -7,6 +7,8 @@
 3. refuses numbers made in single precision where JAX computes in double precision,
 4. evaluates every function at the prior mean, outside of compiled code; the results must be finite. Functions of time
    wait for the initial time (`check_at`).
+
+Source: Hartikainen, Seppänen and Särkkä (2012), ICML, section 3.
 """
 
 from __future__ import annotations
@@ -72,7 +74,7 @@ class LatentForceModel(eqx.Module):
         >>> model.state_names
         ('x0',)
 
-    Source: Hartikainen, Seppänen and Särkkä (2012), ICML, section 3.
+    Source: Hartikainen, Seppänen and Särkkä (2012), section 3.
     """
 
     dynamics: Callable[..., jax.Array]

@@ -8,6 +8,8 @@
 5. Process noise enters with the dispersion at the start of the step (Ito), spread evenly over the step.
 6. At the end of a step that crosses a jump of a force, draw the jump. Events end intervals, like breakpoints.
 7. Draw the observations at the rows from the noise or the observation family.
+
+Source: Kloeden and Platen (1992), Numerical Solution of Stochastic Differential Equations, section 9.1.
 """
 
 from __future__ import annotations
@@ -72,7 +74,7 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
         >>> lfm.simulate(jax.random.key(0), model, jnp.arange(4.0)).y.shape
         (4, 1)
 
-    Source: Kloeden and Platen (1992), Numerical Solution of Stochastic Differential Equations, section 9.1.
+    Source: Kloeden and Platen (1992), section 9.1.
     """
     checks.random_key(key)
     checks.positive_integer("steps", steps)

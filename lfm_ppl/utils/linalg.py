@@ -355,11 +355,13 @@ def semidefinite_root(p: jax.Array, tolerance: float = 1e-14) -> jax.Array:
 
 
 def pivoted_root(p: jax.Array) -> jax.Array:
-    """Return ``R`` (n, n) with ``R R' = P`` for a semi-definite ``P``, by `pivoted_cholesky`.
+    """Return ``R`` (n, n) with ``R R' = P`` for a semi-definite ``P``, by Cholesky's method with complete pivoting.
 
     ``R R'`` is as accurate as ``P``, even for singular ``P``. `semidefinite_root` eliminates the coordinates in the
     given order and loses variance of later coordinates where the conditional variance of an earlier one is pure
     rounding error. In contrast to `semidefinite_root`, this root is neither triangular nor continuous in ``P``.
+
+    Source: Higham (2002), Accuracy and Stability of Numerical Algorithms, section 10.3.
     """
     if p.shape[-1] == 0:
         return p

@@ -5,6 +5,8 @@ One step from x, with the prior N(m, C):
 2. Draw an angle a uniformly; the bracket of angles is ``[a - 2 pi, a]``.
 3. If the likelihood at ``m + (x - m) cos a + (v - m) sin a`` reaches the level, move there.
 4. Otherwise shrink the bracket to a, on the side away from zero, draw a new angle in it, and repeat step 3.
+
+Source: Murray, Adams and MacKay (2010), Elliptical slice sampling, JMLR W&CP 9, 541-548.
 """
 
 from __future__ import annotations

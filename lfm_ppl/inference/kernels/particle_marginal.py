@@ -6,6 +6,9 @@ One step:
 3. Estimate the likelihood at x' with a particle filter, and accept with the ratio of the estimates (and the inverse
    ratio of step 2). The estimate at an accepted point is kept, never drawn again.
 4. In the warm-up, adapt S to half of the acceptance probability of an exact likelihood.
+
+Source: Andrieu, Doucet and Holenstein (2010), JRSS B 72(3); Golightly, Henderson and Sherlock (2015), Statistics and
+Computing 25.
 """
 
 from __future__ import annotations

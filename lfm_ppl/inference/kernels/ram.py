@@ -2,6 +2,8 @@
 
 1. `RAM` holds the options, and adapts the algorithm of `robust_metropolis` to NumPyro's kernel interface.
 2. The first proposal covariance is a multiple of the identity, or given, for example from `lfm_ppl.map_estimate`.
+
+Source: Vihola (2012), Statistics and Computing 22.
 """
 
 from __future__ import annotations

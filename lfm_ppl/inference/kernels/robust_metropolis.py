@@ -185,7 +185,9 @@ def adapt(chol: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Array:
     Returns:
         Factor ``S_{n+1}`` of shape (d, d).
 
-    Source: Vihola (2012), equation (1).
+    Source:
+        Vihola (2012), Robust adaptive Metropolis algorithm with coerced acceptance rate, Statistics
+        and Computing 22, 997-1008, equation (1).
     """
     tiny = jnp.finfo(chol.dtype).tiny
     direction = noise / jnp.sqrt(jnp.maximum(jnp.sum(noise**2), tiny))
