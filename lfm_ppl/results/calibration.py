@@ -4,6 +4,8 @@
 2. Sample the posterior, and rank the true parameters and the log likelihood among thinned draws.
 3. Many data sets run as tasks; the data sets of a task share one compiled program.
 4. Uniform ranks indicate a calibrated sampler (`p_values`).
+
+Source: Talts et al. (2018), arXiv:1804.06788; Modrak et al. (2023), Bayesian Analysis, for the log likelihood.
 """
 
 from __future__ import annotations
@@ -99,8 +101,8 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
         >>> {name: rank.shape for name, rank in found.ranks.items()}
         {'level': (5,), 'log likelihood': (5,)}
 
-    Source: Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
-    arXiv:1804.06788; Modrak et al. (2023), Bayesian Analysis, for the log likelihood as a test quantity.
+    Source: Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration; Modrak et
+    al. (2023), Bayesian Analysis, for the log likelihood as a test quantity.
     """
     checks.random_key(key)
     for name, value in (("data_sets", data_sets), ("draws", draws), ("thin", thin), ("warmup", warmup)):

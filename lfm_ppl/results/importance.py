@@ -3,6 +3,8 @@
 1. Average the replicates of the reference likelihood of each draw, with the variance of the average.
 2. Smooth the largest ratios by a generalised Pareto distribution; its index k measures reliability.
 3. Correct means and standard deviations by the weights, with standard errors of the changes (the delta method).
+
+Source: Vehtari et al. (2024), JMLR 25(72).
 """
 
 from __future__ import annotations

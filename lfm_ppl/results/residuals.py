@@ -3,6 +3,8 @@
 1. Average the standardised residuals over the draws.
 2. Test mean, variance and normality, and whiteness by the Ljung-Box test, output by output.
 3. `misfit` returns one message for each rejection.
+
+Source: Ljung and Box (1978), Biometrika 65.
 """
 
 from __future__ import annotations

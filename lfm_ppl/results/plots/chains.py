@@ -2,6 +2,8 @@
 
 1. Left, every draw in its order, with divergences marked.
 2. Right, the ranks of the draws of each chain among all draws, one histogram above the other.
+
+Source: Vehtari et al. (2021), Bayesian Analysis 16.
 """
 
 from __future__ import annotations
