@@ -5,6 +5,9 @@
 3. `smooth` gives probabilities of the regimes and moments of the state, as averages over draws of regimes.
 4. `sample_path` draws states and regimes given the data; `lfm_ppl.fit` stores such paths.
 5. `sample` simulates the real model by `switching.switched_simulation`, with the chain as its rule.
+
+Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8); Carter and Kohn (1994), Biometrika
+81(3).
 """
 
 from __future__ import annotations
