@@ -39,8 +39,8 @@ def fixed(texts: Sequence[str], anchors: Mapping[str, float], options: Collectio
         if (option := name.partition("[")[0]) in options:
             option_flag = f"--option {option}={'VALUE' if value == FREE else value}"
             raise ValueError(f"--set {text}: {option} is an option of the model, not a parameter: {option_flag}.")
-        values_by_name = {other: number for other, number in values_by_name.items()
-                          if name not in (other, other.partition("[")[0])}
+        values_by_name = {anchor: number for anchor, number in values_by_name.items()
+                          if name not in (anchor, anchor.partition("[")[0])}
         if value != FREE:
             values_by_name[name] = _number(name, value)
         elif not any(name in (anchor, anchor.partition("[")[0]) for anchor in anchors):

@@ -179,7 +179,7 @@ def _assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: 
             problem: LikelihoodProblem, iterated: np.ndarray | None) -> AccuracyReport:
     """Return the report from log likelihoods (C, S) at draws ``draw_index`` (S,) of each chain.
 
-    They are those of the Gaussian filter, also with twice as many steps and with more iterations (None: no more).
+    ``filtered`` is of the Gaussian filter, ``doubled`` of twice as many steps, ``iterated`` of more iterations.
     """
     posterior = arviz_data.group(result, "posterior")
     averaged = _summed(reference.estimates.reshape(*filtered.shape, *reference.estimates.shape[1:]))

@@ -311,7 +311,7 @@ def build_result(problem: FitProblem, draws: PosteriorDraws, processed: PostProc
 def lay_out_sites(bound: BoundModel, sites: Mapping[str, SiteProblem], values: dict[str, np.ndarray],
                   statistics: dict[str, np.ndarray],
                   processed: PostProcessing) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return groups and site attributes of a result; ``values`` and ``statistics`` are those of `PosteriorDraws`."""
+    """Return groups and site attributes of a result, from ``values`` and ``statistics`` of `PosteriorDraws`."""
     groups: dict[str, dict[str, Any]] = {}
     attributes: dict[str, Any] = {}
     for name, site in sites.items():

@@ -40,7 +40,7 @@ def fit_task(model: Callable, name: str, value: Any, options: dict[str, Any], se
              digests: dict[Any, str]) -> Task:
     """Return the task of one data set, ``(times, y)`` or `lfm.Data`.
 
-    ``options`` are arguments of `fit`, ``digests`` those of the model for other data sets, which are extended here.
+    ``options`` are arguments of `fit`; ``digests`` of the model for other data sets are extended here.
     """
     keywords = options.get("model_kwargs") or {}
     if isinstance(value, Data):
