@@ -32,7 +32,7 @@ from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.inference.traced_model import TracedModel
 from lfm_ppl.utils import checks
 
-_FORWARD_MODE_LIMIT = 4
+_FORWARD_MODE_LIMIT = 3
 """Largest number of unconstrained parameters for which forward-mode gradients are faster."""
 
 _ATTEMPTS = 20

@@ -140,8 +140,8 @@ def map_estimate(
         hessian: ``"autodiff"``, or ``"finite-differences"`` of the gradient: about 9 digits instead
             of 15, no second derivatives, and for a latent force model less than half the time to
             compile. By default differences for a model with a filter, and ``"autodiff"`` for others.
-        forward_mode: take derivatives in forward mode, the only possible one for a model with a
-            ``jax.lax.while_loop``; by default with up to ten parameters, where it is faster.
+        forward_mode: take derivatives in forward mode, the only one for a Hessian by automatic differentiation of a
+            model with a ``jax.lax.while_loop``; by default with up to three parameters, where it is faster.
         max_iterations: largest number of iterations of L-BFGS for each start.
 
     Returns:

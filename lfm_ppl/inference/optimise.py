@@ -29,15 +29,28 @@ _EXACT_NOISE, _DIFFERENCE_NOISE = 1e-12, 1e-7
 
 
 def value_and_gradient(function: Callable[..., jax.Array], forward_mode: bool) -> Callable[..., tuple]:
-    """Return the function from z and further arguments to the value and the gradient with respect to z."""
-    if not forward_mode:
-        return jax.value_and_grad(function)
+    """Return the function from z and further arguments to the value and the gradient with respect to z.
+
+    A function without a reverse mode is differentiated in forward mode.
+    """
 
     def value_with_copy(*arguments: Any) -> tuple[jax.Array, jax.Array]:
         value = function(*arguments)
         return value, value
 
-    return lambda *arguments: jax.jacfwd(value_with_copy, has_aux=True)(*arguments)[::-1]
+    def forward(*arguments: Any) -> tuple[jax.Array, jax.Array]:
+        return jax.jacfwd(value_with_copy, has_aux=True)(*arguments)[::-1]
+
+    def reverse(*arguments: Any) -> tuple[jax.Array, jax.Array]:
+        try:
+            return jax.value_and_grad(function)(*arguments)
+        except ValueError as error:
+            # A `jax.lax.while_loop` of the user; JAX raises this when it traces the program.
+            if "Reverse-mode differentiation does not work" not in str(error):
+                raise
+            return forward(*arguments)
+
+    return forward if forward_mode else reverse
 
 
 @dataclass

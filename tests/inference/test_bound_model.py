@@ -389,3 +389,25 @@ print(model_digest(lfm.bind(file.model, data.times, data.y, **file.keywords(data
     digests = {subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed}, check=True,
                               capture_output=True, text=True).stdout for seed in ("0", "2")}
     assert len(digests) == 1 and len(digests.pop().strip()) == 64
+
+
+def test_gradients_of_a_model_with_a_loop_without_reverse_mode():
+    """Four parameters, whose gradient is taken in reverse mode elsewhere."""
+
+    def model(times, y=None):
+        z = numpyro.sample("z", dist.Normal(0.0, 1.0).expand([4]))
+        # The square root of 1 + z^2 by Newton's method.
+        rate = jax.lax.while_loop(lambda v: v[1] < 6, lambda v: (0.5 * (v[0] + (1 + z[0]**2) / v[0]), v[1] + 1),
+                                  (jnp.ones(()), 0))[0]
+        system = lfm.LatentForceModel(
+            lambda x, u, t: u - rate * x, {"u": lfm.Matern(jnp.exp(z[1]), 1.0)},
+            lfm.GaussianObservation(lambda x, u, t: x, jnp.exp(z[2:3])), lfm.Gaussian(z[3:], jnp.eye(1)))
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+    bound = lfm.bind(model, jnp.arange(4.0), jnp.array([[0.1], [0.4], [-0.3], [0.2]]))
+    z, step = jnp.array([0.3, -0.2, 0.5, 1.0]), 1e-5
+    value, gradient = bound.log_density_gradient(z)
+    differences = [(bound.log_density(z.at[i].add(step)) - bound.log_density(z.at[i].add(-step))) / (2 * step)
+                   for i in range(4)]
+    np.testing.assert_allclose(value, bound.log_density(z))
+    np.testing.assert_allclose(gradient, differences, rtol=1e-6)
