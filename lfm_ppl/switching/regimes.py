@@ -1,21 +1,23 @@
 r"""Filter, smoother and draws of a model that switches between K regimes by a Markov chain.
 
-The state s is Gaussian in each regime r, with p(r_k = j | y_1:k) beside it. For each interval of the time grid:
+The state s is Gaussian given each source i, which is a regime with one of the M histories of the n - 2 regimes before
+it (GPBn; GPB2 and IMM have one history, so that a source is a regime). For each interval of the time grid:
 
-1. Where a new regime may begin, after an observation, the states of each regime are merged by their moments, and the
-   chain moves: c_ij = p(r_k-1 = i | y_1:k-1) P_ij.
-2. GPB2 takes the state of each regime i on under each regime j, K^2 filters. IMM merges the states that enter regime j
-   by their moments, too, with the weights c_ij / sum_i c_ij, and takes K filters. GPBn keeps a state for each history
-   of the last n - 1 regimes, and takes K^n filters.
+1. Where a new regime may begin, after an observation, states of the same source are merged by their moments, and the
+   chain moves: c_ij = p(i | y_1:k-1) P_ij, with P_ij from the regime of i to the regime j.
+2. GPBn takes the state of each source i on under each regime j, K^n filters. IMM merges the states that enter regime j
+   by their moments, too, with the weights c_ij / sum_i c_ij, and takes K filters.
 3. The one-step-ahead density is the mixture sum_ij c_ij N(y_k; mu_ij, S_ij), whose terms are the new weights.
 
 From the last interval to the first, for each of S draws of the later state s_k+1 and its regime j,
 
-4. p(r_k = i | s_k+1, j, y) is proportional to p(r_k = i | y_1:k) P_ij N(s_k+1; m_ij, P_ij), with the predictions (i, j)
-   from the merged states, and the smoother's gain gives the Gaussian of s_k in regime i. Both are drawn from this law.
-   After the last observation the chain is simulated.
+4. p(i | s_k+1, j, y) is proportional to c_ij N(s_k+1; m_ij, P_ij), with the predictions (i, j) from the merged states,
+   and the smoother's gain gives the Gaussian of s_k given i. Both are drawn from this law, which is exact given the
+   merged states. After the last observation the chain is simulated.
 5. Given a path of regimes the model is that of one filter: its trace goes to the backward scan of the smoother, and
    draws of the state are exact.
+
+The index of a source is ``regime * M + history``, and that of a history has the oldest regime last.
 
 Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8), for IMM; Tugnait (1982), Automatica
 18(5), for GPBn; Carter and Kohn (1994), Biometrika 81(3), for the draws.
@@ -45,8 +47,9 @@ from lfm_ppl.utils import checks
 from lfm_ppl.utils.gaussian_residuals import log_density
 from lfm_ppl.utils.linalg import cholesky, diagonal, semidefinite_root, solve_lower
 
-MERGINGS = ("imm", "gpb2", "gpb3", "gpb4")
-"""Methods of merging, by the number of latest regimes for each of whose histories a state is kept."""
+MERGINGS = {"imm": 0, "gpb2": 1, "gpb3": 2, "gpb4": 3}
+"""Methods of merging -> number of latest regimes for whose histories there are states; 0: merged before the prediction.
+"""
 
 _JITTER = 1e-10
 """Relative variance added to a predicted covariance whose density is compared between regimes: it may be singular."""
@@ -60,7 +63,7 @@ class RegimeProblem(NamedTuple):
         initial: (K,), probabilities of the regimes at the first observation.
         transitions: (N, K, K), probabilities p(r_k = j | r_k-1 = i) at the starts of the intervals.
         is_start: (N,), whether an interval is the first after an observation, so that the regime may change.
-        memory: number of latest regimes whose histories have states of their own; 0: merged before the prediction, too.
+        memory: one of the values of `MERGINGS`.
     """
 
     problems: tuple[FilterProblem, ...]
@@ -190,7 +193,7 @@ def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[Regi
         log_weight = _log(sources.probability) + trace.log_likelihood
         total = logsumexp(log_weight)
         weight = jnp.exp(log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
-        # The oldest regime of a history comes last.
+        # The oldest regime is forgotten.
         joint, sources = jax.tree.map(lambda a: a.reshape(count, histories, -1, *a.shape[2:]), (weight, trace.filtered))
         filtered = RegimeMoments(joint.sum(2), jax.vmap(jax.vmap(merge))(joint, sources))
         residual = ndtri(jnp.clip(sum(distributions), 1e-15, 1 - 1e-15))
@@ -276,7 +279,7 @@ def sample_states(key: jax.Array, regimes: RegimeProblem, y: jax.Array, path: ja
 
 
 def _source_probabilities(weights: jax.Array, predicted: Moments, state: jax.Array) -> jax.Array:
-    """Return the probabilities (K,) of the regimes from which the later ``state`` (n,) came."""
+    """Return the probabilities (K M,) of the sources from which the later ``state`` (n,) came."""
 
     def density(mean: jax.Array, covariance: jax.Array) -> jax.Array:
         # A known coordinate gets a width far below its size and above its rounding errors.
