@@ -217,10 +217,6 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     return result
 
 
-_Diagnostics = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
-"""Fields of a result from ``log_likelihood`` to ``converged``."""
-
-
 def smooth_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int, damping: float,
               settings: SiteSettings) -> SmootherResult:
     """Smooth on the intervals of a time grid, without checks; for compiled code."""
@@ -234,13 +230,14 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, it
     mean, covariance = (a[requested + 1] for a in moments)
     matrix, offset = jax.vmap(ssm.input_map)(times)
     return SmootherResult(
-        times, mean, covariance, matvec(matrix, mean) + offset, congruence(matrix, covariance), *diagnostics, trace,
-        requested, (matrix, offset), ssm.model.state_names, ssm.model.force_names)
+        times, mean, covariance, matvec(matrix, mean) + offset, congruence(matrix, covariance), **diagnostics,
+        _trace=trace, _requested=requested, _input_map=(matrix, offset), state_names=ssm.model.state_names,
+        force_names=ssm.model.force_names)
 
 
 def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int,
-                     damping: float) -> tuple[FilterTrace, Moments, _Diagnostics]:
-    """Return the forward pass, the smoothed moments and the diagnostics."""
+                     damping: float) -> tuple[FilterTrace, Moments, dict[str, jax.Array]]:
+    """Return the forward pass, the smoothed moments and the diagnostics, fields of the result by name."""
     updater, points, change = GaussianUpdate(y), None, jnp.asarray(jnp.nan)
     if iterations:
         points, change = posterior_linearisation(problem, updater, iterations, damping)
@@ -248,12 +245,14 @@ def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int,
     smoothed = backward(problem, trace)
     at_data, left_out = at_intervals((trace._replace(initial=None), smoothed.leave_one_out), problem.grid.observed)
     residual = whitened_innovations(at_data, y)
-    return trace, smoothed.moments, (at_data.log_likelihood, left_out, residual, change, jnp.asarray(True))
+    return trace, smoothed.moments, {
+        "log_likelihood": at_data.log_likelihood, "leave_one_out": left_out, "whitened_innovation": residual,
+        "change": change, "converged": jnp.asarray(True)}
 
 
 def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings,
-                   family: ObservationFamily) -> tuple[FilterTrace, Moments, _Diagnostics]:
-    """Return the same for an observation family."""
+                   family: ObservationFamily) -> tuple[FilterTrace, Moments, dict[str, jax.Array]]:
+    """Return the results of `_smooth_gaussian` for an observation family, with randomised quantile residuals."""
     result = evidence(problem, FamilyTerms(family, y), settings, record=Record.SMOOTHER)
     smoothed = backward(problem, result.trace)
     fixed_point, points = result.refined.fixed_point, result.refined.points
@@ -265,7 +264,9 @@ def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings,
                                 for value in (prequential.log_likelihood, left_out))
     change = jnp.asarray(jnp.nan) if points is None else fixed_point.change
     residual = quantile_residuals(family, prequential.prediction, y)
-    return result.trace, smoothed.moments, (one_step_ahead, left_out, residual, change, fixed_point.converged)
+    return result.trace, smoothed.moments, {
+        "log_likelihood": one_step_ahead, "leave_one_out": left_out, "whitened_innovation": residual,
+        "change": change, "converged": fixed_point.converged}
 
 
 _compiled_smooth = eqx.filter_jit(smooth_on)
