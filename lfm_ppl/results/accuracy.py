@@ -5,6 +5,8 @@
    replicates of a particle filter.
 3. Smooth the importance weights (Pareto), and correct the moments of the parameters.
 4. `judge` turns the numbers into a verdict: trust, corrected, re-run or inconclusive.
+
+Source: Vehtari et al. (2024), JMLR 25(72); Andrieu and Roberts (2009), Annals of Statistics 37(2).
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 1. Align predictions and measurements in time; dates are counted as in the result.
 2. A prediction is a mixture of normal distributions over the draws, draws alone, or the law of an observation family.
 3. Compute the scores of every measurement, and their means by output.
+
+Source: Gneiting and Raftery (2007), Journal of the American Statistical Association 102.
 """
 
 from __future__ import annotations

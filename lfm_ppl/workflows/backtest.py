@@ -3,6 +3,8 @@
 1. Fit the model to the data up to an origin, and forecast the next rows; a second fit compiles nothing.
 2. Forecast the same rows by a reference: persistence, or the seasonal-naive forecast.
 3. Score both, move the origin on, and repeat.
+
+Source: Hyndman and Athanasopoulos (2021), Forecasting: Principles and Practice, section 5.10.
 """
 
 from __future__ import annotations

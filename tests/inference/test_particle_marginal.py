@@ -1,6 +1,5 @@
 """Particle-marginal RAM: exact whatever the noise of the estimate, and whatever the surrogate."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np
