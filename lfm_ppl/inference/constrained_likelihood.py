@@ -170,16 +170,7 @@ class ConstrainedLikelihood(SeriesLikelihood):
         return repeat_draw(draw, key, sample_shape)
 
     def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
-        """Draw a trajectory under the constraints, chosen by its weight among 64.
-
-        Args:
-            key: a JAX random key.
-            y: (T, D), NaN where missing.
-            at: (L,) times; None: the times of the data.
-
-        Returns:
-            (x, u) (L, M + R), and the times (L,).
-        """
+        """Draw a trajectory under the constraints, chosen by its weight among 64; see the base class."""
         posterior = self.truncated_posterior(at)
         proposal = posterior.proposal(y, posterior.propagate_expectations(y))
         path = posterior.sample_trajectories(key, proposal, 1, _CANDIDATES)[..., 0]

@@ -229,7 +229,16 @@ class SeriesLikelihood(dist.Distribution):
         return log_likelihood
 
     def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
-        """Draw a path of a state that is not Gaussian: (x, u) (L, M + R), and its times (L,)."""
+        """Draw a trajectory given the data, for a state that is not Gaussian.
+
+        Args:
+            key: a JAX random key.
+            y: (T, D), NaN where missing.
+            at: (L,) times; None: the times of the data.
+
+        Returns:
+            (x, u) (L, M + R), and the times (L,).
+        """
         raise NotImplementedError
 
     def scores(self, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:

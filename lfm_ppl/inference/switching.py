@@ -253,16 +253,7 @@ class Switching(SeriesLikelihood):
         return build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at)
 
     def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
-        """Draw a trajectory of state, regime and forces given the data.
-
-        Args:
-            key: a JAX random key.
-            y: (T, D), NaN where missing.
-            at: (L,) times; None: the times of the data.
-
-        Returns:
-            (x, indicators of the regimes, u) (L, M + K + R), and the times (L,).
-        """
+        """Draw a trajectory given the data, whose state is (x, indicators of the regimes); see the base class."""
         grid = self.time_grid if at is None else self._grid(at)
         regimes, requested = self.regimes(grid), jnp.asarray(grid.requested)
         path_key, state_key = jax.random.split(key)
