@@ -168,8 +168,7 @@ class Switching(SeriesLikelihood):
         """Return the filter problems of the regimes and the chain on a time grid; None: that of the data."""
         grid = self.time_grid if grid is None else grid
         problems = tuple(filter_problem(ssm, self.rule, grid) for ssm in self.ssms)
-        return RegimeProblem(problems, self.initial, *regime_transitions(self.rates, grid),
-                             MERGINGS[self.merging])
+        return RegimeProblem(problems, self.initial, *regime_transitions(self.rates, grid), MERGINGS[self.merging])
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log density of ``value`` (T, D), NaN where missing; batch dimensions may lead."""

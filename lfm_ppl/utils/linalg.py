@@ -9,7 +9,7 @@
 4. `SemidefiniteFactor` scales a matrix to unit diagonal first, so that one relative tolerance serves all units.
 5. Products and factorisations have derivatives in closed form (custom_jvp), with fewer operations than the
    differentiated algorithm.
-6. Smaller matrices than `_FUSED_SIZE` are unrolled; larger ones use XLA's dot and loops, which keeps compilation short.
+6. Loops over matrices up to `_FUSED_SIZE` are unrolled; larger ones use XLA's dot and scans, which compile fast.
 
 Source: Golub and Van Loan (2013), Matrix Computations, chapter 4; Higham (2002), Accuracy and Stability of Numerical
 Algorithms, chapter 10.
