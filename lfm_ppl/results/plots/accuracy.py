@@ -130,7 +130,10 @@ def _bandwidth(values: np.ndarray, weight: np.ndarray, grid: np.ndarray) -> floa
 
 def _density(grid: np.ndarray, values: np.ndarray, weight: np.ndarray, support: tuple[float, float],
              bandwidth: float | None = None) -> np.ndarray:
-    """Return a Gaussian kernel density estimate, reflected at both ends so that it keeps its mass in between."""
+    """Return a Gaussian kernel density estimate, reflected at both ends so that it keeps its mass in between.
+
+    Source: Silverman (1986), Density Estimation, section 2.10.
+    """
     bandwidth = bandwidth or _bandwidth(values, weight, grid)
     total = np.zeros_like(grid)
     for points in (grid, 2.0 * support[0] - grid, 2.0 * support[1] - grid):
