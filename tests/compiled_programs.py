@@ -14,7 +14,7 @@ def compilations():
     class Handler(logging.Handler):
         def emit(self, record):
             # "stage" brings an array to the device.
-            if record.getMessage().startswith("Compiling") and "jit(stage)" not in record.getMessage():
+            if record.getMessage().startswith("Finished XLA compilation") and "jit(stage)" not in record.getMessage():
                 names.append(record.getMessage()[:120])
 
     logger, handler = logging.getLogger("jax"), Handler()

@@ -12,6 +12,7 @@ import jax
 import pytest
 
 from lfm_ppl.utils.compilation import quick_compilation
+from lfm_ppl.utils.programs import forget_executables
 
 # ArviZ 0.23 writes the date of an announcement when it is first imported on a day, which two workers cannot do at once:
 # the process that starts them does it before.
@@ -76,6 +77,7 @@ def release_compiled_programs():
         _give_back_free_memory()
         if _crowded():
             jax.clear_caches()
+            forget_executables()
             gc.collect()
             _give_back_free_memory()
 
