@@ -15,6 +15,7 @@ import pytest
 from random_models import AHEAD, ROWS, Series, Structure, batch, build, structure
 
 import lfm_ppl as lfm
+from lfm_ppl.utils.programs import forget_executables
 
 CUT = 4
 FEW, MANY = 4, 12
@@ -152,4 +153,5 @@ def test_many_structures(first):
     for seed in range(first, first + 5):
         said += complaints(seed, MANY)
         jax.clear_caches()
+        forget_executables()
     assert not said, "\n".join(said)

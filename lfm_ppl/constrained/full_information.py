@@ -33,6 +33,7 @@ from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import matmul
+from lfm_ppl.utils.programs import shared_jit
 
 
 class ConstrainedEstimate(eqx.Module):
@@ -113,7 +114,7 @@ def full_information(model: LatentForceModel, times: ArrayLike, y: ArrayLike,
     Without active constraints the result for a linear model is the smoother's mean.
 
     Args:
-        model: the latent force model.
+        model: the latent force model; its functions are read once for each model, as by `jax.jit`.
         times: (T,), non-decreasing.
         y: (T, D), NaN where missing.
         lower: name of a state, force or output -> its lower bound, ``{"factor": 0.0}``.
@@ -200,7 +201,7 @@ def solve_problem(problem: ConstrainedProblem, constraints: Constraints, toleran
         ssm.model.state_names, ssm.model.force_names), solution
 
 
-_solve = eqx.filter_jit(solve_problem)
+_solve = shared_jit(solve_problem)
 
 
 def _report_failures(result: ConstrainedEstimate, solution: Solution) -> None:

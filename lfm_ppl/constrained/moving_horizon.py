@@ -44,6 +44,7 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.programs import shared_jit
 
 
 class HorizonState(NamedTuple):
@@ -129,7 +130,7 @@ class MovingHorizon(eqx.Module):
     constraint is active, the estimates for a linear model equal the Kalman filter (delay 0) or the fixed-lag smoother.
 
     Args:
-        model: the latent force model, with an ``initial_time``.
+        model: the latent force model, with an ``initial_time``; its functions are read once, as by `jax.jit`.
         window: number of observations W in the window.
         delay: number of observations after the one that is estimated, less than W; W // 2 by default.
         lower: lower bounds by name, as in `lfm_ppl.full_information`.
@@ -218,7 +219,7 @@ def moving_horizon(model: LatentForceModel, times: ArrayLike, y: ArrayLike, wind
     window as long as the record is equivalent to `lfm_ppl.full_information` with ``grid=times``.
 
     Args:
-        model: the latent force model.
+        model: the latent force model; its functions are read once for each model, as by `jax.jit`.
         times: (T,), non-decreasing.
         y: (T, D), NaN where missing.
         window: number of observations W in the window, from 2 to T.
@@ -355,7 +356,7 @@ def _solve_window(settings: HorizonSettings, state: HorizonState) -> tuple[Const
     return estimate, is_observed
 
 
-@eqx.filter_jit
+@shared_jit
 def _update(settings: HorizonSettings, state: HorizonState, t: jax.Array,
             y: jax.Array) -> tuple[HorizonState, HorizonEstimate]:
     """Advance the state by one observation, and estimate from the new window."""
@@ -371,7 +372,7 @@ _ROW_FIELDS = ("times", "state_mean", "force_mean", "slack", "multiplier", "viol
 """Fields of `ConstrainedEstimate` with one entry for each row."""
 
 
-@eqx.filter_jit
+@shared_jit
 def _estimate_record(settings: HorizonSettings, times: jax.Array, y: jax.Array,
                      initial_time: jax.Array) -> ConstrainedEstimate:
     """Estimate all rows of a record, from its first full window to its last."""

@@ -42,6 +42,7 @@ from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import congruence, diagonal, matmul, safe_sqrt
+from lfm_ppl.utils.programs import shared_jit
 
 _CANDIDATES = 32
 """Number of weighted trajectories from which one draw is chosen."""
@@ -121,7 +122,7 @@ class ConstrainedPosterior(eqx.Module):
         return Trajectories(self.times, inputs[:, :, :size], forces)
 
 
-@eqx.filter_jit
+@shared_jit
 def _sample_inputs(posterior: TruncatedPosterior, proposal: FilterTrace, key: jax.Array, draws: int) -> jax.Array:
     """Return trajectories (draws, K, M + R) of (x, u) at the rows of the scan."""
     batch = min(draws, _BATCH)
@@ -145,7 +146,8 @@ def constrained_posterior(model: LatentForceModel, times: ArrayLike, y: ArrayLik
     mean and the variance of the truncated normal distribution N(c; cavity) 1(c >= 0).
 
     Args:
-        model: the latent force model, with observation noise that is independent between outputs.
+        model: the latent force model, with observation noise that is independent between outputs; its functions
+            are read once, as by `jax.jit`.
         times: (T,), non-decreasing.
         y: (T, D), NaN where missing.
         lower: name of a state, force or output -> its lower bound.
@@ -197,7 +199,7 @@ def constrained_posterior(model: LatentForceModel, times: ArrayLike, y: ArrayLik
     return result
 
 
-@eqx.filter_jit
+@shared_jit
 def _approximate(posterior: TruncatedPosterior, y: jax.Array) -> tuple[tuple, FilterTrace]:
     """Run expectation propagation.
 

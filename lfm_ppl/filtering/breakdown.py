@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +29,7 @@ from lfm_ppl.model.observation_noise import row_log_prob
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.programs import shared_jit
 
 _NEGATIVE = 1e-8
 """Share of the largest variance so far by which one must be negative to be no rounding error."""
@@ -130,13 +130,13 @@ def _explain_row(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array,
             f"predictor {predictor[output]:g} of the output {names[output]!r}: check the link and the initial state")
 
 
-@eqx.filter_jit
+@shared_jit
 def _run_refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, terms: FamilyTerms, settings: SiteSettings,
                 start: Moments) -> FixedPoint:
     return refine(filter_problem(ssm, rule, grid), terms, settings, start).fixed_point
 
 
-@eqx.filter_jit
+@shared_jit
 def _run_moment_matching(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments) -> FilterTrace:
     return assumed_density_filter(filter_problem(ssm, rule, grid), y, start).trace
 
@@ -190,7 +190,7 @@ def _divide_interval(grid: TimeGrid, interval: Intervals, count: int) -> TimeGri
                          observed=last, requested=last, requested_times=interval.start, replicated=False)
 
 
-@eqx.filter_jit
+@shared_jit
 def _run_filter(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, start: Moments) -> FilterTrace:
     return forward(filter_problem(ssm, rule, grid), GaussianUpdate(y), initial=start, record=Record.MOMENTS)
 

@@ -34,6 +34,7 @@ from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import solve_lower
+from lfm_ppl.utils.programs import shared_jit
 
 
 class FilterState(NamedTuple):
@@ -77,7 +78,7 @@ def filter(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     moments of its tilted prediction (assumed density filtering).
 
     Args:
-        model: the latent force model.
+        model: the latent force model; its functions are read once for each model, as by `jax.jit`.
         times: (T,), non-decreasing; equal times are replicates.
         y: (T, D), NaN where missing.
         rule: linearisation rule; `Cubature()` by default.
@@ -146,7 +147,7 @@ def _check_start(start: Any, times: Any, size: int) -> None:
             raise ValueError(f"times[0] = {first:g} lies before {float(start_time):g}, the time of `start`.")
 
 
-@eqx.filter_jit
+@shared_jit
 def filter_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, times: jax.Array,
               initial: Moments | None = None) -> FilterResult:
     """Filter observations (T, D) at ``times`` on the intervals of a time grid; see `filter`."""

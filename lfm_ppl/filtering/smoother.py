@@ -41,6 +41,7 @@ from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import congruence, matmul, safe_sqrt
+from lfm_ppl.utils.programs import shared_jit
 
 
 class MeanSd(NamedTuple):
@@ -165,7 +166,7 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         m_s = m + G (m_s+ - m_p),  P_s = (I - G Phi) P (I - G Phi)' + G (Q + P_s+) G',  G = P Phi' P_p^-1.
 
     Args:
-        model: the latent force model.
+        model: the latent force model; its functions are read once for each model, as by `jax.jit`.
         times: (T,), non-decreasing.
         y: (T, D), NaN where missing.
         rule: linearisation rule; `Cubature()` by default.
@@ -269,4 +270,4 @@ def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings,
         "change": change, "converged": fixed_point.converged}
 
 
-_compiled_smooth = eqx.filter_jit(smooth_on)
+_compiled_smooth = shared_jit(smooth_on)

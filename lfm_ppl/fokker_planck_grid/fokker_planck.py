@@ -35,6 +35,7 @@ from lfm_ppl.model.observation_noise import check_noise, require_gaussian
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import safe_sqrt
+from lfm_ppl.utils.programs import shared_jit
 
 __all__ = ["FokkerPlanckResult", "Grid", "choose_grid", "fokker_planck", "log_likelihood"]
 
@@ -95,7 +96,8 @@ def fokker_planck(model: LatentForceModel, times: ArrayLike, y: ArrayLike, *, at
     cell. Errors are of second order in the width of a cell.
 
     Args:
-        model: a model of state dimension one: one physical state with process noise, or one force with one state.
+        model: a model of state dimension one: one physical state with process noise, or one force with one state. Its
+            functions are read once, as by `jax.jit`.
         times: (T,), non-decreasing.
         y: (T, D), NaN where missing.
         at: (K,) times of the smoothed densities, also after the last observation; by default the observation times.
@@ -267,7 +269,7 @@ def _error(problem: GridProblem, finer: TimeGrid, y: jax.Array, grid: Grid, tota
     return error
 
 
-@eqx.filter_jit
+@shared_jit
 def _filter_and_smooth(cells: Cells, time_grid: TimeGrid, y: jax.Array, times: jax.Array,
                        grid: Grid) -> FokkerPlanckResult:
     """Return the result without its error, which is NaN."""

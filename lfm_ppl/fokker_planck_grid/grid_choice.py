@@ -25,6 +25,7 @@ from lfm_ppl.fokker_planck_grid.grid_filter import log_likelihood_and_reach
 from lfm_ppl.fokker_planck_grid.grid_model import Cells, drift_and_diffusion, on_grid
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils.gaussian_residuals import wrapped
+from lfm_ppl.utils.programs import shared_jit
 
 _COARSE_CELLS = 256
 """Number of cells of the grids on which the bounds are chosen."""
@@ -74,7 +75,7 @@ class GridProblem(eqx.Module):
         return np.asarray(_log_likelihood_and_reach(self.cells(grid), self.time_grid, y)[1])
 
 
-_log_likelihood_and_reach = eqx.filter_jit(log_likelihood_and_reach)
+_log_likelihood_and_reach = shared_jit(log_likelihood_and_reach)
 
 
 def choose(problems: Sequence[GridProblem], y: jax.Array, bounds: tuple[float, float] | None, cells: int | None,

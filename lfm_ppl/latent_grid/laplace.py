@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 from lfm_ppl.latent_grid.latent_grid import LatentGrid
 from lfm_ppl.model.observation_noise import require_gaussian
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.programs import shared_jit
 
 METHODS = ("trust-region", "newton")
 
@@ -135,7 +136,7 @@ def laplace(latent: LatentGrid, y: ArrayLike, method: str = "trust-region", *, i
     return run(latent, latent.checked(y), method, iterations, tolerance)
 
 
-@eqx.filter_jit
+@shared_jit
 def run(latent: LatentGrid, y: jax.Array, method: str, iterations: int, tolerance: float) -> LaplaceResult:
     """Compute Laplace's approximation in compiled code; arguments as in `laplace`."""
     count, size = latent.mean.shape

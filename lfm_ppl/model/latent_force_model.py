@@ -27,7 +27,7 @@ from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.inputs import InputRead, check_reads, has_inputs, input_reads
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observations.family import ObservationFamily
-from lfm_ppl.model.user_functions import TracedFunction, trace
+from lfm_ppl.model.user_functions import TracedFunction, own_functions, trace
 from lfm_ppl.utils import checks
 
 _ROOTS = {"sqrt", "rsqrt", "cbrt", "pow"}
@@ -55,6 +55,9 @@ class LatentForceModel(eqx.Module):
             flow or a reproduction number. Results contain their trajectories and plot them, like
             ``numpyro.deterministic`` for parameters; they do not change the likelihood.
         events: jumps of the state at given times, `Dose` and `Reset`; none by default.
+
+    Functions that take a built model (`lfm.filter`, `lfm.smooth`, ...) read f, h and the others once for each model, as
+    `jax.jit` does: where a variable that they read has changed, build the model again.
 
     Raises:
         ValueError, TypeError: f returns a wrong shape; a function takes an entry out of range, or is not made of JAX
@@ -112,11 +115,11 @@ class LatentForceModel(eqx.Module):
     ):
         _check_types(dynamics, observation, initial_state)
         self.force_names, self.forces = _forces_by_name(forces)
-        self.dynamics, self.initial_state = dynamics, initial_state
+        self.dynamics, self.initial_state = own_functions(dynamics), initial_state
         if isinstance(observation, ObservationFamily):
             observation = observation.with_output_sizes(
                 lambda function: self._trace_observation(function).shape.shape[0])
-        self.observation = observation
+        self.observation = own_functions(observation)
         if initial_time is not None:
             checks.finite("initial_time", initial_time)
         # A concrete time stays a NumPy array: inside jit jnp.asarray returns a tracer, but time grids need the number.
@@ -127,10 +130,11 @@ class LatentForceModel(eqx.Module):
         if overlap := set(self.state_names) & set(self.force_names):
             raise ValueError(f"the name {sorted(overlap)[0]!r} is used for a state and for a force; rename one.")
         self.events = _events(events, self.state_names)
-        self.process_noise = process_noise if callable(process_noise) else _dispersion(process_noise, size)
-        self.deterministics = _functions(deterministics, {*self.state_names, *self.force_names})
+        self.process_noise = own_functions(process_noise if callable(process_noise)
+                                           else _dispersion(process_noise, size))
+        self.deterministics = own_functions(_functions(deterministics, {*self.state_names, *self.force_names}))
         self.deterministic_names = tuple(self.deterministics)
-        functions = self._trace_functions()
+        functions = self.traced_functions()
         self.output_names = _names("output_names", output_names, functions["observation"].shape.shape[0], "y")
         if isinstance(self.observation, ObservationFamily):
             self.observation.check_shapes(len(self.output_names))
@@ -170,7 +174,7 @@ class LatentForceModel(eqx.Module):
                              "one output, return x[:1] or jnp.array([...]).")
         return traced
 
-    def _trace_functions(self) -> dict[str, TracedFunction]:
+    def traced_functions(self) -> dict[str, TracedFunction]:
         """Return the traced functions of the model by name, after checks of their shapes and indices."""
         arguments, observation = self._arguments, self.observation
         functions = {"dynamics": trace("dynamics", "f(x, u, t)", self.dynamics, *arguments)}
@@ -258,11 +262,11 @@ class LatentForceModel(eqx.Module):
             ValueError: an input with ``outside="error"`` is read beyond its table; with "warn" it is a warning.
         """
         if self._has_limited_inputs:
-            check_reads(tuple(self._trace_functions().values()), first, last)
+            check_reads(tuple(self.traced_functions().values()), first, last)
 
     def input_reads(self, first: float, last: float) -> list[InputRead]:
         """Return the reads of known inputs between observations, see `lfm_ppl.model.inputs.input_reads`."""
-        functions = _integrated_functions(self._trace_functions()) if self._has_integrated_inputs else []
+        functions = _integrated_functions(self.traced_functions()) if self._has_integrated_inputs else []
         return input_reads(functions, first, last)
 
     def _check_finite(self, time: Any) -> None:

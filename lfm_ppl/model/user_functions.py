@@ -17,6 +17,7 @@ Source: https://docs.jax.dev/en/latest/jaxpr.html for the structure of jaxprs.
 from __future__ import annotations
 
 import contextlib
+import functools
 import inspect
 import math
 import os
@@ -142,6 +143,25 @@ class TracedFunction:
                             for value in step.operands[-3:]]
                 times, values, time = operands
                 yield TableRead(name, times, values, time, step.is_conditional)
+
+
+def own_function(function: Callable) -> Callable:
+    """Return a plain function that calls ``function``, unequal to all others and hashable.
+
+    `jax.jit` compiles once for equal functions. A model whose functions are its own is compiled for what they compute
+    when it is built, although a variable that they read may have changed since another model had the same functions.
+    """
+
+    @functools.wraps(function, updated=())
+    def call(*arguments: Any) -> Any:
+        return function(*arguments)
+
+    return call
+
+
+def own_functions(tree: Any) -> Any:
+    """Return a pytree with each function that is a leaf as an `own_function`."""
+    return jax.tree.map(lambda leaf: own_function(leaf) if callable(leaf) else leaf, tree)
 
 
 def trace(label: str, form: str, function: Callable, *arguments: Any) -> TracedFunction:

@@ -32,6 +32,7 @@ from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.particles.resampling import RESAMPLING, effective_sample_size, resample, reweight
 from lfm_ppl.particles.stochastic_steps import ParticleTransition, StepConstants, choose_scheme, initial_particles
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.programs import shared_jit
 
 
 class ParticleSettings(NamedTuple):
@@ -112,7 +113,7 @@ def particle_filter(key: jax.Array, model: LatentForceModel, times: ArrayLike, y
 
     Args:
         key: a JAX random key.
-        model: the latent force model.
+        model: the latent force model; its functions are read once for each model, as by `jax.jit`.
         times: (T,), non-decreasing; equal times are replicates.
         y: (T, D), NaN where missing.
         particles: number of particles N.
@@ -151,7 +152,7 @@ def particle_filter(key: jax.Array, model: LatentForceModel, times: ArrayLike, y
     return _filter_moments(ssm, grid, y, jnp.asarray(times, float), key, settings)
 
 
-@eqx.filter_jit
+@shared_jit
 def _filter_moments(ssm: StateSpaceModel, grid: TimeGrid, y: jax.Array, times: jax.Array, key: jax.Array,
                     settings: ParticleSettings) -> ParticleFilterResult:
     """Run the filter and return its moments at the observations."""

@@ -36,6 +36,7 @@ from lfm_ppl.particles.stochastic_steps import choose_scheme
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gaussian_residuals import log_density
 from lfm_ppl.utils.linalg import cholesky, matmul, solve_lower
+from lfm_ppl.utils.programs import shared_jit
 
 BACKWARD, TRACING = "backward simulation", "ancestor tracing"
 METHODS = (BACKWARD, TRACING)
@@ -130,7 +131,7 @@ def particle_smoother(key: jax.Array, model: LatentForceModel, times: ArrayLike,
 
     Args:
         key: a JAX random key.
-        model: the latent force model.
+        model: the latent force model; its functions are read once for each model, as by `jax.jit`.
         times: (T,), non-decreasing.
         y: (T, D), NaN where missing.
         particles: number of particles N.
@@ -175,7 +176,7 @@ def particle_smoother(key: jax.Array, model: LatentForceModel, times: ArrayLike,
     if (size := 8 * rows * particles * (ssm.state_dim + 2)) > _LARGEST_HISTORY:
         raise ValueError(f"the particles of {rows} rows would take {size / 2**30:.1f} GiB; smoothing keeps all of "
                          f"them. Take at most {particles * _LARGEST_HISTORY // size} particles, or fewer steps.")
-    states, indices, _ = eqx.filter_jit(draw_trajectories)(ssm, grid, y, key, settings, draws, method)
+    states, indices, _ = shared_jit(draw_trajectories)(ssm, grid, y, key, settings, draws, method)
     distinct = np.array([len(np.unique(row)) for row in np.asarray(indices)])
     return ParticleSmootherResult(jnp.asarray(grid.requested_times, float), jnp.moveaxis(states, 0, 1),
                                   jnp.asarray(distinct), ssm, method, settings.scheme)

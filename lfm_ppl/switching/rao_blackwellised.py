@@ -54,6 +54,7 @@ from lfm_ppl.switching.switched_model import (
 )
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import congruence, matmul, semidefinite_root, solve_semidefinite
+from lfm_ppl.utils.programs import shared_jit
 
 
 class RaoBlackwellisedResult(eqx.Module):
@@ -164,7 +165,7 @@ def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     return _filter(problem, jnp.asarray(times, float), y, key, resampling, threshold, is_input_additive(build))
 
 
-@eqx.filter_jit
+@shared_jit
 def _filter(problem: SwitchedProblem, times: jax.Array, y: jax.Array, key: jax.Array, resampling: str,
             threshold: float, shared: bool) -> RaoBlackwellisedResult:
     """Run the filter; ``shared``: all particles have the same covariance."""

@@ -25,6 +25,7 @@ from lfm_ppl.switching.switched_model import (
 )
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import semidefinite_root
+from lfm_ppl.utils.programs import shared_jit
 
 
 class SwitchedSimulation(eqx.Module):
@@ -93,7 +94,7 @@ def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     return _simulate(problem, schemes, jnp.asarray(times, float), key)
 
 
-@eqx.filter_jit
+@shared_jit
 def _simulate(problem: SwitchedProblem, schemes: tuple[str, ...], times: jax.Array,
               key: jax.Array) -> SwitchedSimulation:
     """Simulate all paths; ``schemes`` are the integration schemes of the models."""

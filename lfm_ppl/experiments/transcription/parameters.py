@@ -29,6 +29,7 @@ from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.linearisation.sigma_points import GaussHermite
 from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.results import importance
+from lfm_ppl.utils.programs import forget_executables
 
 RULE, STEPS = GaussHermite(7), 6
 FORCE_TIMES = np.linspace(0.0, problem.END, 61)
@@ -96,6 +97,7 @@ def compute(task: Task) -> Result:
     """
     # Programs of one task, half a gigabyte each, are of no use to other tasks.
     jax.clear_caches()
+    forget_executables()
     settings, configuration = task.settings, problem.configuration(task)
     sampler = SAMPLERS[settings["sampler"]]
     data = problem.data_set(configuration, settings["index"], task.seed)
