@@ -1,9 +1,10 @@
 """A NumPyro model with its times and data bound: its log posterior as a plain function, compiled once.
 
-1. `bind` checks times and data and looks up the `TracedModel` of the model function.
-2. Methods of `BoundModel` compile a function of z and y when first called, and keep it in the traced model.
+1. `bind` checks times and data and runs the model (`TracedModel`).
+2. Methods of `BoundModel` trace a function of z and y when first called, and keep it in the traced model.
 3. Data are an argument of each function, so that data sets of one shape share it. Times, known inputs and other real
-   arrays are arguments of each `program`, so that all models of one structure share it (`TracedModel.share_programs`).
+   arrays are arguments of each `program`, so that models of one structure have programs of one text, which are
+   compiled once (`lfm_ppl.utils.programs`).
 4. A model that needs the values of its data gets None as argument: its data are constants of the program.
 """
 
@@ -12,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +31,7 @@ from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.inference.traced_model import TracedModel
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.programs import Program
 
 _FORWARD_MODE_LIMIT = 3
 """Largest number of unconstrained parameters for which forward-mode gradients are faster."""
@@ -47,7 +48,9 @@ class BoundModel:
         log_density(z) = log p(y | T(z)) + log p(T(z)) + log |dT/dz|.
 
     Data, times and inputs are arguments of the compiled functions, so that another data set of the same shape compiles
-    nothing, and many data sets are a `jax.vmap`. Made by `lfm_ppl.bind`.
+    nothing, and many data sets are a `jax.vmap`. Made by `lfm_ppl.bind`, which reads the model function, and each
+    method reads it once more at the first call, as `jax.jit` does: where a function that it calls or a variable that it
+    reads has changed, bind it again.
 
     Every method of z and y can be traced (``jax.jit``, ``jax.grad``, ``jax.vmap``); z is a vector (d,) in the order of
     ``names``, and ``y`` defaults to the bound data.
@@ -202,7 +205,7 @@ class BoundModel:
             z: (d,).
             y: data of the shape that was bound; None: the bound data.
         """
-        run = self.program("log density", lambda: jax.jit(self._target(True)))
+        run = self.program("log density", lambda: Program(self._target(True)))
         return run(self._position(z), self._arguments(y))
 
     def log_density_gradient(self, z: ArrayLike, y: ArrayLike | None = None) -> tuple[jax.Array, jax.Array]:
@@ -212,7 +215,7 @@ class BoundModel:
     def gradient(self, forward_mode: bool, jacobian: bool = True) -> Any:
         """Return the compiled function from z and y to the log density and its gradient, by either mode."""
         run = self.program(("gradient", jacobian, forward_mode),
-                           lambda: jax.jit(value_and_gradient(self._target(jacobian), forward_mode)))
+                           lambda: Program(value_and_gradient(self._target(jacobian), forward_mode)))
         return lambda z, y: run(z, self._arguments(y))
 
     def log_likelihood(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
@@ -221,13 +224,13 @@ class BoundModel:
             sites = [model._site_at(z, y) for model in self.site_models.values()]
             return jnp.stack([site.distribution.log_prob(site.observed).sum() for site in sites]).sum()
 
-        run = self.program("log likelihood", lambda: jax.jit(log_likelihood))
+        run = self.program("log likelihood", lambda: Program(log_likelihood))
         return run(self._position(z), self._arguments(y))
 
     def log_prior(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
         """Return the log prior density of the unconstrained parameters, Jacobian included."""
         traced = self.traced
-        run = self.program("log prior", lambda: jax.jit(
+        run = self.program("log prior", lambda: Program(
             lambda z, y: -traced.potential(z, y, remove_likelihood)))
         return run(self._position(z), self._arguments(y))
 
@@ -264,7 +267,7 @@ class BoundModel:
             return Objective(minus)
         first_derivative = jax.jacfwd if is_forward else jax.jacrev
         hessian = self.program(("hessian", jacobian, is_forward),
-                               lambda: jax.jit(jax.jacfwd(first_derivative(self._target(jacobian)))))
+                               lambda: Program(jax.jacfwd(first_derivative(self._target(jacobian)))))
 
         def minus_hessian(z: Any) -> Any:
             return -hessian(jnp.asarray(z, float), self.arguments)
@@ -297,13 +300,13 @@ class BoundModel:
 
     def constrain(self, z: ArrayLike, y: ArrayLike | None = None) -> dict[str, jax.Array]:
         """Return site name -> value of the latent and the deterministic sites at z (d,)."""
-        run = self.program("constrain", lambda: jax.jit(self.traced.constrain))
+        run = self.program("constrain", lambda: Program(self.traced.constrain))
         return run(self._position(z), self._arguments(y))
 
     def constrain_draws(self, z: ArrayLike) -> dict[str, np.ndarray]:
         """Return site name -> values (..., *shape) at draws z (..., d)."""
         traced = self.traced
-        run = self.program("constrain draws", lambda: jax.jit(jax.vmap(traced.constrain, in_axes=(0, None))))
+        run = self.program("constrain draws", lambda: Program(jax.vmap(traced.constrain, in_axes=(0, None))))
         values = run(jnp.asarray(z, float).reshape(-1, self.size), self.arguments)
         return {name: np.asarray(value).reshape(*np.shape(z)[:-1], *value.shape[1:]) for name, value in values.items()}
 
@@ -401,7 +404,7 @@ class BoundModel:
             site = self._site_at(z, y)
             return site.distribution.filter(site.observed)
 
-        return self.program("filter", lambda: eqx.filter_jit(run))(_as_arrays(z), self._arguments(y))
+        return self.program("filter", lambda: Program(run))(_as_arrays(z), self._arguments(y))
 
     def smooth(self, z: ArrayLike | Mapping[str, Any], at: ArrayLike | None = None,
                y: ArrayLike | None = None) -> SmootherResult:
@@ -424,9 +427,9 @@ class BoundModel:
             return site.distribution.smooth(site.observed, times)
 
         if times is None:
-            return self.program("smooth", lambda: eqx.filter_jit(run))(_as_arrays(z), self._arguments(y))
+            return self.program("smooth", lambda: Program(run))(_as_arrays(z), self._arguments(y))
         data = self._all_data(y)
-        return self.compiled(("smooth", signature(times)), lambda: eqx.filter_jit(run))(
+        return self.compiled(("smooth", signature(times)), lambda: Program(run))(
             _as_arrays(z), None if self.argument is None else data)
 
     def _check_single(self, name: str) -> None:
@@ -458,8 +461,8 @@ class BoundModel:
         def trace_modified() -> TracedModel:
             modified = TracedModel(modify(traced.model), traced.arguments, traced.data_index, traced.keywords,
                                    self.model_data, traced.caller)
-            identity = traced.identity and (traced.identity, self._selected, name)
-            return modified.share_programs(identity) if is_cached else modified
+            identity = traced.identity, self._selected, name
+            return modified.take_inputs_as_arguments(identity) if is_cached else modified
 
         with jax.ensure_compile_time_eval():  # the call may come from compiled code
             is_cached = name[1] is not None and not checks.traced(self.model_data)

@@ -12,6 +12,7 @@ import numpy as np
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.utils.programs import Program
 
 
 class LogPosterior:
@@ -74,7 +75,7 @@ class LogPosterior:
             batch: how many are computed at a time; a thousand no longer fit the CPU's cache, and take seven times as
                 long each.
         """
-        run = self.bound.compiled(("log densities of draws", self.names, batch), lambda: jax.jit(
+        run = self.bound.compiled(("log densities of draws", self.names, batch), lambda: Program(
             lambda all_, y: jax.lax.map(lambda z: self.log_densities(z, y), all_, batch_size=batch)))
         log_likelihood, log_prior = run(jnp.asarray(draws), y)
         return np.asarray(log_likelihood), np.asarray(log_prior)
@@ -91,5 +92,5 @@ class LogPosterior:
             return -log_likelihood - prior * log_prior
 
         run = self.bound.compiled(("energy", self.names, self._forward_mode),
-                                  lambda: jax.jit(value_and_gradient(energy, self._forward_mode)))
+                                  lambda: Program(value_and_gradient(energy, self._forward_mode)))
         return Objective(lambda z: run(z, y, prior))

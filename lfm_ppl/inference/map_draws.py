@@ -23,6 +23,7 @@ from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.utils.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
+from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.progress import Progress, Reporter
 
 _SEQUENTIAL_BATCH = 8
@@ -105,7 +106,7 @@ def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable | SharedF
         arguments = bound.arguments, *per_draw.arguments
     else:
         function, compiled, arguments = per_draw, bound.compiled, (bound.argument,)
-    run = compiled(("map draws", is_vectorized, name), lambda: jax.jit(by_fours if is_vectorized else sequential))
+    run = compiled(("map draws", is_vectorized, name), lambda: Program(by_fours if is_vectorized else sequential))
     keys = split_keys(key, count)
 
     def batch_arguments(start: int) -> tuple[dict[str, np.ndarray], jax.Array, *tuple[Any, ...]]:
@@ -119,7 +120,7 @@ def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable | SharedF
                if part is not None and len(jax.tree.leaves(part)[0]) == batch}
     batches = [batch_arguments(start) for start in starts if start not in results]
     if len(batches) > 1 and parallel > 1:
-        run = cast(Any, run).lower(*batches[0]).compile()
+        run = cast(Program, run).compile(*batches[0])
     computed = side_by_side(lambda *batch: jax.tree.map(np.asarray, run(*batch)), batches, parallel)
     label = name if isinstance(name, str) else name[0]
     with contextlib.closing(computed) as new, Progress(report, count, "draws", label) as progress:

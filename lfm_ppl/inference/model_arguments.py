@@ -3,13 +3,12 @@
 1. `ModelInputs` splits times, keyword arguments and time grids into arrays, which a program takes as arguments, and
    everything else, which is a part of the pytree's structure, so that `jax.jit` compiles another program for it.
 2. `ModelArguments` adds the data.
-3. `signature` compares pytrees by value, and `variables_of` finds the variables that a model function reads.
+3. `signature` compares pytrees by value.
 """
 
 from __future__ import annotations
 
-import types
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -92,43 +91,17 @@ def signature(value: Any) -> Hashable:
     return structure, tuple(_leaf_signature(leaf) for leaf in leaves)
 
 
-def variables_of(function: Callable) -> dict[str, Any]:
-    """Return the global and closure variables that a Python function reads, functions inside it included.
-
-    A function whose variables have changed is another model. Variables of functions that it calls are not followed, as
-    in `jax.jit`.
-    """
-    if not isinstance(function, types.FunctionType):
-        return {}
-    names = set(_global_names(function.__code__))
-    variables = {name: value for name, value in function.__globals__.items() if name in names}
-    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-    for name, cell in cells:
-        try:
-            variables[name] = cell.cell_contents
-        except ValueError:  # a variable without a value so far
-            continue
-    return variables
-
-
-def _global_names(code: types.CodeType) -> Iterator[str]:
-    yield from code.co_names
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            yield from _global_names(constant)
-
-
 def _leaf_signature(leaf: Any) -> Hashable:
     if isinstance(leaf, (np.ndarray, np.generic, jax.Array)):
         return np.shape(leaf), str(np.asarray(leaf).dtype), np.asarray(leaf).tobytes()
     try:
         hash(leaf)
     except TypeError:
-        return _Identity(leaf)
+        return Identity(leaf)
     return type(leaf), leaf
 
 
-class _Identity:
+class Identity:
     """Hash an object by its identity, and keep it alive so that its identity is not reused."""
 
     def __init__(self, value: Any) -> None:
@@ -136,7 +109,7 @@ class _Identity:
 
     def __eq__(self, candidate: object) -> bool:
         """Whether both refer to the same object."""
-        return isinstance(candidate, _Identity) and candidate.value is self.value
+        return isinstance(candidate, Identity) and candidate.value is self.value
 
     def __hash__(self) -> int:
         """Return the hash of the identity."""

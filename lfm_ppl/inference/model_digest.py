@@ -19,6 +19,8 @@ from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.inference.switching import Switching
 from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.utils.programs import Program
 
 _TIMES = 16
 """Number of times at which the functions of a model are evaluated."""
@@ -27,14 +29,11 @@ _SHIFT = 0.1
 """Distance of the second point from the prior's medians, in each unconstrained coordinate."""
 
 
-def model_digest(bound: BoundModel) -> str | None:
+def model_digest(bound: BoundModel) -> str:
     """Return a digest of the values of prior, dynamics and observation, and of the settings of the likelihood.
 
-    They are evaluated at the prior's medians and at one other point, at 16 times and one state, without the filter. The
-    digest is None for a model that needs the values of its data.
+    They are evaluated at the prior's medians and at one other point, at 16 times and one state, without the filter.
     """
-    if bound.argument is None:
-        return None
     medians = jnp.asarray(bound.draw(jax.random.key(0)))
     times = np.unique(np.concatenate([np.ravel(part) for part in jax.tree.leaves(bound.times)]))
     selection = np.unique(np.linspace(0, len(times) - 1, _TIMES).round().astype(int))
@@ -58,7 +57,7 @@ def _digest_program(bound: BoundModel) -> tuple[Any, _record_values]:
         prior = potential_energy(recorder, *bound.traced.call(arguments), bound.unravel(z))
         return prior, recorder.values
 
-    return jax.jit(evaluate), recorder
+    return Program(evaluate), recorder
 
 
 def _rounded(array: np.ndarray) -> bytes:
@@ -96,10 +95,32 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         self.values, self.settings = [], ""
 
     def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
-        """Evaluate the model of the likelihood, of its first series for a panel."""
+        """Evaluate the models of the likelihood, of its first series for a panel."""
         distribution = likelihood.first if isinstance(likelihood, Panel) else likelihood
         ssm, model = distribution.ssm, distribution.model
-        w = 0.3 + 0.1 * jnp.arange(ssm.input_dim)
+        # Not the leaves of the distribution itself: NumPyro orders its fields by their hashes.
+        names = sorted(set(type(likelihood).gather_pytree_data_fields()) - {"model", "models"})
+        fields = [getattr(likelihood, name) for name in names]
+        self.values += [*_arrays((fields, distribution.rule)), *(self._values(ssm) for ssm in distribution.ssms)]
+        self.settings += repr((
+            site["name"], distribution.rule, distribution.steps, model.state_names, model.output_names,
+            model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
+            model.deterministic_names, ssm.stack.jump_times,
+            [event.observation_first for event in model.events]))
+        if isinstance(distribution, ConstrainedLikelihood):
+            boxes, (x, u) = distribution.truncated_posterior().boxes, ssm.split(_point(ssm))
+            self.values.append(jax.vmap(lambda t: boxes(x, u, t))(self.times))
+            self.settings += repr((boxes.constraints.labels, distribution.grid, distribution.draws))
+        elif isinstance(distribution, Switching):
+            self.settings += repr((distribution.regime_names, distribution.max_step, distribution.merging))
+        else:
+            self.settings += repr((distribution.max_step, distribution.iterations, distribution.damping,
+                                   distribution.tolerance, distribution.method, distribution.sites))
+        return super().replacement(likelihood, site)
+
+    def _values(self, ssm: StateSpaceModel) -> list[Any]:
+        """Return the arrays of a model, those that its functions read included, and values of the functions."""
+        model, w = ssm.model, _point(ssm)
 
         def functions(t: jax.Array) -> list[Any]:
             values = [ssm.drift(w, t), ssm.dispersion(w, t), ssm.observe(w, t), ssm.obs_cov(w, t, 0), ssm.input_map(t),
@@ -109,26 +130,16 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
                 values.append(model.observation.select_row(0).log_prob(f, f))
             return values
 
-        # Not the leaves of the distribution itself: NumPyro orders its fields by their hashes.
-        names = sorted(set(type(likelihood).gather_pytree_data_fields()))
-        fields = [getattr(likelihood, name) for name in names]
-        arrays = [jnp.asarray(leaf) for leaf in jax.tree.leaves((fields, distribution.rule))
-                  if eqx.is_array_like(leaf)]
-        self.values += [*arrays, ssm.initial(), ssm.stack.feedback(), ssm.stack.dispersion(),
-                        ssm.stack.jump_table(), *jax.tree.leaves((model.events, ssm.state_maps())),
-                        jax.vmap(functions)(self.times)]
-        self.settings += repr((
-            site["name"], distribution.rule, distribution.steps, model.state_names, model.output_names,
-            model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
-            model.deterministic_names, ssm.stack.jump_times,
-            [event.observation_first for event in model.events]))
-        if isinstance(distribution, ConstrainedLikelihood):
-            boxes = distribution.truncated_posterior().boxes
-            self.values.append(boxes(*ssm.split(w), self.times[0]))
-            self.settings += repr((boxes.constraints.labels, distribution.grid, distribution.draws))
-        elif isinstance(distribution, Switching):
-            self.settings += repr((distribution.regime_names, distribution.max_step, distribution.merging))
-        else:
-            self.settings += repr((distribution.max_step, distribution.iterations, distribution.damping,
-                                   distribution.tolerance, distribution.method, distribution.sites))
-        return super().replacement(likelihood, site)
+        tables = [value for function in model.traced_functions().values() for value in function.closed.consts]
+        return [*_arrays((model, [table for table in tables if np.size(table) > 1])), ssm.initial(),
+                ssm.stack.feedback(), ssm.stack.dispersion(), ssm.stack.jump_table(), ssm.state_maps(),
+                jax.vmap(functions)(self.times)]
+
+
+def _arrays(tree: Any) -> list[jax.Array]:
+    return [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree) if eqx.is_array_like(leaf)]
+
+
+def _point(ssm: StateSpaceModel) -> jax.Array:
+    """Return state and forces (M + R,) at which functions are evaluated."""
+    return 0.3 + 0.1 * jnp.arange(ssm.input_dim)

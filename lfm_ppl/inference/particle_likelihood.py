@@ -27,6 +27,7 @@ from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.particles.particle_filter import ParticleSettings, check_settings, log_likelihood
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.programs import Program
 
 _REPLICATES = 64
 """Filters whose log likelihoods give the standard deviation of one; that is known to a tenth of itself then."""
@@ -188,7 +189,7 @@ class ParticlePotential:
         Estimates of zero count as the worst of the others; infinite where they are the majority.
         """
         name = ("spread of estimates", self.settings._replace(particles=particles), self._steps)
-        run = self._bound.compiled(name, lambda: jax.jit(
+        run = self._bound.compiled(name, lambda: Program(
             lambda z, keys, y: jax.lax.map(lambda k: self(z, k, particles, y), keys)))
         energies = np.asarray(run(z, jax.random.split(key, _REPLICATES), self._bound.argument))
         finite = np.isfinite(energies)

@@ -29,6 +29,7 @@ from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.interruption import Interruption, was_interrupt
+from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.progress import Console, Progress
 
 CHAIN_METHODS = ("parallel", "vectorized", "sequential")
@@ -212,7 +213,7 @@ def _init_program(sampler: BoundSampler) -> Any:
     def init(key: jax.Array, z: jax.Array, energy: jax.Array, slope: jax.Array, y: Any, tuning: Any) -> Any:
         return algorithm.init(key, ParamInfo(bound.unravel(z), energy, bound.unravel(slope)), y, tuning)
 
-    return sampler.compiled("start", lambda: jax.jit(jax.vmap(init, in_axes=(0, 0, 0, 0, None, None))))
+    return sampler.compiled("start", lambda: Program(jax.vmap(init, in_axes=(0, 0, 0, 0, None, None))))
 
 
 def _to_host(state: Any) -> list[np.ndarray]:
@@ -303,9 +304,9 @@ def _advance(sampler: BoundSampler, method: str, mesh: Mesh | None) -> Callable:
         return jax.lax.fori_loop(first, end, body, (state, rows))
 
     if method == "sequential":
-        return jax.jit(advance)
+        return Program(advance)
     if mesh is None:
-        return jax.jit(jax.vmap(advance, in_axes=(0, 0, None, None, None, None, None)))
+        return Program(jax.vmap(advance, in_axes=(0, 0, None, None, None, None, None)))
 
     def advance_on_device(state: Any, rows: Any, *arguments: Any) -> tuple[Any, Any]:
         """Advance the chain of one device."""
@@ -314,5 +315,5 @@ def _advance(sampler: BoundSampler, method: str, mesh: Mesh | None) -> Callable:
 
     replicated = PartitionSpec()
     in_specs = (_CHAIN_AXIS, _CHAIN_AXIS, *[replicated] * 5)
-    return jax.jit(jax.shard_map(advance_on_device, mesh=mesh, in_specs=in_specs, out_specs=_CHAIN_AXIS,
+    return Program(jax.shard_map(advance_on_device, mesh=mesh, in_specs=in_specs, out_specs=_CHAIN_AXIS,
                                  check_vma=False))

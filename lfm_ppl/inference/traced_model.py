@@ -7,20 +7,19 @@
    constant times of step 1 then replace them. Times that depend on parameters or data stay traced.
 4. Keep the compiled functions by name. Data are an argument of each, so that all data sets of one shape share them.
 5. Run the model with abstract times and arrays, too. Where that works, they become arguments of programs, with the time
-   grids that were laid out for their values; models of one structure share these programs (`share_programs`). Where it
-   fails, programs are compiled for the values.
-6. Keep the latest models (`traced_model`), by the identity of the model function, its other arguments, the shapes of
-   the data and the variables that the function reads.
-
-`jax.jit` does the caching by shapes and dtypes.
+   grids that were laid out for their values. Where it fails, programs are compiled for the values.
+6. Every call of `traced_model` runs the model anew. Two traced models share machine code where their programs have the
+   same text (`lfm_ppl.utils.programs`), and the programs themselves only where `SharedPrograms` are in use, whose
+   caller knows that the model function stays the same.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import re
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from contextvars import ContextVar
 from typing import Any
 
 import jax
@@ -36,12 +35,10 @@ from numpyro.infer.util import log_density as constrained_log_density
 from lfm_ppl.filtering.time_grid import refuse_traced_times
 from lfm_ppl.inference.likelihood_site import SiteTimes, likelihood_sites, record_likelihoods, replace_times
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.inference.model_arguments import ModelArguments, ModelInputs, shapes, signature, variables_of
+from lfm_ppl.inference.model_arguments import Identity, ModelArguments, ModelInputs, shapes
 from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, latent_sites
 from lfm_ppl.utils import checks
-
-_CACHED_MODELS, _CACHED_PROGRAMS = 8, 32
-"""Models that are kept for the next data set, and structures of models whose compiled functions are kept."""
+from lfm_ppl.utils.programs import Program
 
 _SITEWISE_STRATEGIES = (init_to_median, init_to_sample)
 """Initialisation strategies that depend on a site alone, so that they can be compiled."""
@@ -52,6 +49,33 @@ _DUPLICATE_NAME = re.compile("unique names but got `(.*)` duplicated")
 _TRACING_ERRORS = (TypeError, ValueError, IndexError, AttributeError)
 """Errors of code that needs the value of a tracer: JAX's errors for Python branches, NumPy functions and masks, missing
 attributes of NumPy arrays, and errors of this library for times that must be concrete."""
+
+
+class SharedPrograms:
+    """Programs of all models that are bound while they are in use, by the structure of the model.
+
+    A model function is then read once for each structure of its arguments: only for callers that bind one model to many
+    data sets, between which it does not change, such as `lfm_ppl.fit_many`.
+    """
+
+    def __init__(self) -> None:
+        self.by_structure: dict[Hashable, dict[Hashable, Any] | None] = {}  # None: programs need the arguments' values
+
+    def __reduce__(self) -> tuple[type[SharedPrograms], tuple]:
+        """Leave the programs out, which belong to one process."""
+        return SharedPrograms, ()
+
+    @contextlib.contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Let models that are bound in this context have these programs."""
+        token = _programs_in_use.set(self)
+        try:
+            yield
+        finally:
+            _programs_in_use.reset(token)
+
+
+_programs_in_use: ContextVar[SharedPrograms | None] = ContextVar("programs in use", default=None)
 
 
 class TracedModel:
@@ -72,10 +96,10 @@ class TracedModel:
         size: number of unconstrained coordinates d.
         likelihoods: the likelihood sites at the prior's medians, without observations.
         sites_of_times: names of likelihood sites that observe the times instead of the data.
-        functions: name -> compiled function, or another object that depends on this model alone.
-        identity: key of the model function; None where its programs are not shared.
-        programs: name -> compiled function that models of one structure share, see `share_programs`.
+        functions: name -> program, or another object, for the values of the arguments.
+        programs: name -> program of `program_arguments`.
         inputs: arguments of these programs besides the data; None where they depend on the values of the arguments.
+        identity: key of the model function among `SharedPrograms`.
     """
 
     def __init__(self, model: Callable, arguments: tuple, data_index: int | None, keywords: Mapping[str, Any],
@@ -85,7 +109,7 @@ class TracedModel:
         self.caller = caller
         self.functions: dict[Hashable, Any] = {}
         self.programs = self.functions
-        self.identity: Hashable = None
+        self.identity: Hashable = Identity(model)
         self.inputs: ModelInputs | None = None
         self._structures: list[Hashable] = []
         self._seeded = handlers.seed(model, self.key)
@@ -172,29 +196,30 @@ class TracedModel:
             jnp.zeros(self.size), shapes(self._example), only_site=site)
         return ModelInputs.of((), recorded[site].padded())
 
-    def share_programs(self, identity: Hashable) -> TracedModel:
+    def take_inputs_as_arguments(self, identity: Hashable = None) -> TracedModel:
         """Make times, arrays among the arguments and time grids arguments of programs, if the model can be traced so.
 
-        Programs are then shared by all models of one identity, one structure and one shape of the arrays. Not where a
-        likelihood is a panel or has constraints, where its times depend on parameters, or where the structure of the
-        model depends on the values of its arguments.
+        Not where a likelihood is a panel or has constraints, where its times depend on parameters, or where the
+        structure of the model depends on the values of its arguments. Where `SharedPrograms` are in use, models of
+        one identity, one structure and one shape of the arrays have the same programs.
+
+        Args:
+            identity: key of the model function; None: the function itself.
         """
         layouts = [self.site_times.get(site.name, SiteTimes(None)).layout for site in self.likelihoods]
-        if self.data_index is None or identity is None or not layouts or any(layout is None for layout in layouts):
+        if self.data_index is None or not layouts or any(layout is None for layout in layouts):
             return self
         inputs = ModelInputs.of((self.arguments, self.keywords), {
             name: times._replace(layout=times.layout.padded()) for name, times in self.site_times.items()
             if times.layout is not None})
         arguments = shapes(ModelArguments(self._example, inputs))
+        self.identity = self.identity if identity is None else identity
         leaves, structure = jax.tree.flatten(arguments)
-        key = identity, structure, *self._structures, *((leaf.shape, str(leaf.dtype)) for leaf in leaves)
-        if key not in _programs:
-            _programs[key] = {} if self._is_traceable(arguments) else None
-            if len(_programs) > _CACHED_PROGRAMS:
-                _programs.popitem(last=False)
-        _programs.move_to_end(key)
-        self.identity = identity
-        if (programs := _programs[key]) is not None:
+        key = self.identity, structure, *self._structures, *((leaf.shape, str(leaf.dtype)) for leaf in leaves)
+        by_structure = (_programs_in_use.get() or SharedPrograms()).by_structure
+        if key not in by_structure:
+            by_structure[key] = {} if self._is_traceable(arguments) else None
+        if (programs := by_structure[key]) is not None:
             self.programs, self.inputs = programs, inputs
         return self
 
@@ -239,7 +264,7 @@ class TracedModel:
         if strategy not in _SITEWISE_STRATEGIES or self.data_index is None or checks.traced(y):
             return run(key, y)
         # With many data sets of one shape, running the model in Python would take longer than everything else.
-        return self.program(("draw", strategy), lambda: jax.jit(run))(key, self.program_arguments(y))
+        return self.program(("draw", strategy), lambda: Program(run))(key, self.program_arguments(y))
 
     def potential(self, z: jax.Array, y: Any, handler: Callable[[Callable], Callable] | None = None) -> Any:
         """Return minus the log density of the unconstrained parameters, Jacobian included.
@@ -287,7 +312,7 @@ class TracedModel:
         return self.functions[name]
 
     def program(self, name: Hashable, make: Callable[[], Any]) -> Any:
-        """Return the compiled function of this name of `program_arguments`, whatever their values."""
+        """Return the program of this name, a function of `program_arguments`, whatever their values."""
         if name not in self.programs:
             self.programs[name] = make()
         return self.programs[name]
@@ -316,42 +341,21 @@ def _traced_structure(likelihood: MarginalLikelihood) -> Hashable:
     return _structure(likelihood)
 
 
-_models: OrderedDict[Hashable, TracedModel] = OrderedDict()
-_programs: OrderedDict[Hashable, dict[Hashable, Any] | None] = OrderedDict()
-"""Compiled functions by the identity and structure of a model; None where they need the values of its arguments."""
-
-
 def traced_model(model: Callable, arguments: tuple, keywords: Mapping[str, Any],
                  caller: str) -> tuple[TracedModel, Any]:
-    """Return the traced model and its data, the last argument where it is a pytree of real arrays.
-
-    A model that was traced before with equal arguments and data of the same shape is returned again.
-    """
+    """Return the traced model and its data, the last argument where it is a pytree of real arrays."""
     data_index = len(arguments) - 1 if arguments and _is_numeric(arguments[-1]) else None
     data = None if data_index is None else jax.tree.map(lambda leaf: jnp.asarray(checks.unmask(leaf)), arguments[-1])
     static = arguments if data_index is None else (*arguments[:-1], None)
-    key = signature((static, dict(keywords), jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), data)))
-    variables = variables_of(model)
-    # Whatever is built from tracers must not be reused after their trace has ended.
-    is_cached = key is not None and not checks.traced(data) and not checks.traced(jax.tree.leaves(variables))
-    key = (model, key, signature(variables))
     with jax.ensure_compile_time_eval():  # the call may come from compiled code
-        if is_cached and key in _models:
-            _models.move_to_end(key)
-            return _models[key], data
         try:
             traced = TracedModel(model, static, data_index, keywords, data, caller)
             _ = traced.site_times  # runs the model with tracers
         except _TRACING_ERRORS:
             # The model needs the values of its data; any other error is raised again.
             return TracedModel(model, arguments, None, keywords, data, caller), data
-        if is_cached:
-            traced.share_programs((model, signature(variables)))
-    if is_cached:
-        _models[key] = traced
-        if len(_models) > _CACHED_MODELS:
-            _models.popitem(last=False)
-    return traced, data
+        is_concrete = not checks.traced((static, dict(keywords), data))
+        return traced.take_inputs_as_arguments() if is_concrete else traced, data
 
 
 def _unconstrained(sites: Mapping[str, Any]) -> dict[str, jax.Array]:

@@ -20,6 +20,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.traced_model import SharedPrograms
 from lfm_ppl.io.data import as_data
 from lfm_ppl.io.data_set import model_keywords
 from lfm_ppl.results import arviz_data
@@ -172,11 +173,11 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
     model = bound.site.example.ssm.model
     angular = np.isin(np.arange(y.shape[1]), model.observation.angular)
     reference = "persistence" if season is None else "seasonal-naive"
-    forecasts, naive, messages = [], [], []
+    forecasts, naive, messages, programs = [], [], [], SharedPrograms()
     for origin in origins:
         past = np.where(np.arange(len(times))[:, None] <= origin, y, np.nan)
         future = slice(origin + 1, origin + 1 + horizon)
-        with warnings.catch_warnings(record=True) as caught:
+        with warnings.catch_warnings(record=True) as caught, programs.in_use():
             warnings.simplefilter("always")
             try:
                 result = fit(numpyro_model, times, past, sampler=sampler, seed=seed, at=times, trajectory_draws=draws,

@@ -64,11 +64,11 @@ class ManyFits:
             failed.
     """
 
-    def __init__(self, model: Callable, tasks: Mapping[str, Task], out: Path | None, **task_options: Any) -> None:
+    def __init__(self, compute: FitDataSet, tasks: Mapping[str, Task], out: Path | None, **task_options: Any) -> None:
         self.names = tuple(tasks)
         self.failed: dict[str, str] = {}
         self.refused: dict[str, str] = {}
-        self._model, self._tasks, self._out, self._task_options = model, tasks, out, task_options
+        self._compute, self._tasks, self._out, self._task_options = compute, tasks, out, task_options
         self._tables: dict[str, pd.DataFrame] = {}
         self._draws: dict[str, dict[str, xr.Dataset]] = {}
         self._attrs: dict[str, Any] = {}
@@ -84,7 +84,7 @@ class ManyFits:
             yield Fitted(name, None, ValueError(reason))
         names = {task.name: name for name, task in self._tasks.items()}
         folder = None if self._out is None else self._out / "fits"
-        for outcome in outcomes(self._tasks.values(), FitDataSet(self._model), folder, **self._task_options):
+        for outcome in outcomes(self._tasks.values(), self._compute, folder, **self._task_options):
             name, result = names[outcome.task.name], None
             if outcome.result is None:
                 self.failed[name] = outcome.reason
@@ -236,14 +236,16 @@ def fit_many(
         checks.one_of("data set in each", name, names)
         _check_options(f"each[{name!r}]", each[name], [*shared, "truth", "name"])
     tasks: dict[str, Task] = {}
+    compute = FitDataSet(numpyro_model)
     digests: dict[Any, str] = {}
     for name, value in pairs:
         if not isinstance(name, str) or not name:
             raise TypeError(f"the names of data sets must be texts, got {name!r}.")
         if name in tasks:
             raise ValueError(f"two data sets are called {name!r}; give every one a name of its own.")
-        tasks[name] = fit_task(numpyro_model, name, value, {**options, **each.get(name, {})}, seed, digests)
-    return ManyFits(numpyro_model, tasks, None if out is None else Path(out), workers=workers, overwrite=overwrite,
+        with compute.programs.in_use():
+            tasks[name] = fit_task(numpyro_model, name, value, {**options, **each.get(name, {})}, seed, digests)
+    return ManyFits(compute, tasks, None if out is None else Path(out), workers=workers, overwrite=overwrite,
                     report=(report or Console()) if progress else None)
 
 

@@ -14,7 +14,9 @@ import jax
 import numpy as np
 
 from lfm_ppl.inference.bind import bind
+from lfm_ppl.inference.model_arguments import signature
 from lfm_ppl.inference.model_digest import model_digest
+from lfm_ppl.inference.traced_model import SharedPrograms
 from lfm_ppl.io.data_set import Data, model_keywords
 from lfm_ppl.parallel.task import Task
 from lfm_ppl.results.packing import pack_result
@@ -66,13 +68,17 @@ def fit_task(model: Callable, name: str, value: Any, options: dict[str, Any], se
 
 def _model_digest(model: Callable, times: np.ndarray, y: np.ndarray, keywords: Any, digests: dict[Any, str]) -> str:
     """Return a digest of the model, which changes with its code."""
-    key = (times.tobytes(), y.shape, json.dumps(plain_value(dict(keywords or {}))))
-    if key not in digests:
-        try:
-            digests[key] = model_digest(bind(model, times, y, **dict(keywords or {}))) or "unknown"
-        except Exception:  # raised again by the fit of this data set
-            return "none"
-    return digests[key]
+    key = signature((times, y.shape, dict(keywords or {})))
+    if key in digests:
+        return digests[key]
+    try:
+        bound = bind(model, times, y, **dict(keywords or {}))
+        value = model_digest(bound)
+    except Exception:  # raised again by the fit of this data set
+        return "none"
+    if bound.argument is not None:  # else the model depends on the values of its data
+        digests[key] = value
+    return value
 
 
 def plain_value(value: Any) -> Any:
@@ -102,15 +108,17 @@ def file_name(name: str) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class FitDataSet:
-    """Function from a task to the result of its fit as arrays."""
+    """Function from a task to the result of its fit as arrays; all tasks of a process have the same programs."""
 
     model: Callable
+    programs: SharedPrograms = dataclasses.field(default_factory=SharedPrograms, compare=False)
 
     def __call__(self, task: Task) -> dict[str, Any]:
         """Return the result of `fit` with its warnings as attribute `WARNINGS`."""
         times, y, options = task.data
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
-            result = fit(self.model, times, y, progress=False, **options)
+            with self.programs.in_use():
+                result = fit(self.model, times, y, progress=False, **options)
         messages = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
         return pack_result(result, {WARNINGS: json.dumps(messages)})
