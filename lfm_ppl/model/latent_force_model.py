@@ -138,7 +138,7 @@ class LatentForceModel(eqx.Module):
         self.output_names = _names("output_names", output_names, functions["observation"].shape.shape[0], "y")
         if isinstance(self.observation, ObservationFamily):
             self.observation.check_shapes(len(self.output_names))
-        self.unit_items = tuple((units or {}).items())
+        self.unit_items = tuple(sorted((units or {}).items()))  # JAX sorts a dict that is an argument
         self.nonlinear_inputs = None if nonlinear_inputs is None else tuple(nonlinear_inputs)
         for name in self.nonlinear_inputs or ():
             checks.one_of("name in nonlinear_inputs", name, (*self.state_names, *self.force_names))

@@ -25,30 +25,32 @@ def parameters():
     return (numpyro.sample("lag", dist.Uniform(0.1, 0.9)), numpyro.sample("rate", dist.LogNormal(-1.0, 0.5)))
 
 
-def infusion(times, y=None, inputs=None, R=None):
+def infusion(times, y=None, inputs=None, R=None, units=None):
     """Non-linear, with a known input, and errors that are known row by row."""
     lag, rate = parameters()
     built = system(lambda x, u, t: inputs["rate"](t) - rate * x / (lag + x**2) + u, R)
     numpyro.sample("y", lfm.MarginalLikelihood(built, times, steps=2, iterations=0), obs=y)
 
 
-def lagged(times, y=None, inputs=None, R=None):
+def lagged(times, y=None, inputs=None, R=None, units=None):
     lag, rate = parameters()
     built = system(lambda x, u, t: inputs["rate"](t - lag) - rate * x + u, R)
     numpyro.sample("y", lfm.MarginalLikelihood(built, times, steps=2), obs=y)
 
 
-def doses(times, y=None, inputs=None, R=None):
+def doses(times, y=None, inputs=None, R=None, units=None):
     lag, rate = parameters()
     taken, amounts = inputs["rate"].times, inputs["rate"].values
     events = [lfm.Dose(taken, amounts, "x0"), lfm.Dose(taken, rate, "x0", lag=lag)]
-    numpyro.sample("y", lfm.MarginalLikelihood(system(lambda x, u, t: u - rate * x, R, events=events), times), obs=y)
+    numpyro.sample("y", lfm.MarginalLikelihood(system(
+        lambda x, u, t: u - rate * x, R, events=events, units=units), times), obs=y)
 
 
 def patient(shift, amount, variance):
     """Times that are not regular, a table of three amounts, and a variance for each row."""
     table = lfm.Input(np.array([0.0, 2.5 + shift, 6.0]), np.array([amount, 0.3, 0.0]), outside="hold")
-    return TIMES + shift * (TIMES == 4.0), {"inputs": {"rate": table}, "R": np.full((6, 1, 1), variance)}
+    return TIMES + shift * (TIMES == 4.0), {
+        "inputs": {"rate": table}, "R": np.full((6, 1, 1), variance), "units": {"u": "1/h", "time": "h"}}
 
 
 @pytest.mark.parametrize("model", [infusion, lagged, doses])
