@@ -40,6 +40,7 @@ from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.model.structure import pattern
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import matmul
+from lfm_ppl.utils.random_keys import split_by_name
 
 _LOG_2PI = 1.8378770664093453
 
@@ -116,11 +117,11 @@ class TruncatedPosterior(eqx.Module):
 
         Bounded states and forces are computed from their drawn slacks, and so feasible in floating-point arithmetic.
         """
-        keys = jax.random.split(key)
-        paths = self.sample_paths(keys[0], forward_pass, draws * candidates)
+        keys = split_by_name(key, ("candidates", "choice"))
+        paths = self.sample_paths(keys["candidates"], forward_pass, draws * candidates)
         # The second half of the paths mirrors the first: this order spreads mirrored pairs over different draws.
         order = jnp.arange(draws * candidates).reshape(candidates, draws).T
-        candidate = jax.random.categorical(keys[1], paths.log_weights[order], axis=1)
+        candidate = jax.random.categorical(keys["choice"], paths.log_weights[order], axis=1)
         index = jnp.take_along_axis(order, candidate[:, None], axis=1)[:, 0]
         observed = jnp.asarray(self.grid.observed)
         is_possible = jnp.isfinite(jnp.take_along_axis(paths.log_weights, index, axis=0))

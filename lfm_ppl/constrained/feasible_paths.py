@@ -33,6 +33,7 @@ from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
 from lfm_ppl.filtering.update import Sites
 from lfm_ppl.utils.linalg import congruence, diagonal, matmul, semidefinite_root
+from lfm_ppl.utils.random_keys import split_by_name
 
 _ROUNDING_VARIANCE = 1e-13
 """Variances below this multiple of the predicted variance (of a state: of its variance before the draws of its row) are
@@ -69,11 +70,11 @@ def sample_feasible_paths(key: jax.Array, forward_pass: FilterTrace, is_constrai
         count: number of trajectories S, even.
     """
     intervals, size = forward_pass.phi.shape[:2]
-    keys = jax.random.split(key)
+    keys = split_by_name(key, ("uniforms", "normals"))
     # The quantiles of zero and one may be infinite.
-    uniforms = jax.random.uniform(keys[0], (intervals, is_constrained.shape[1], count // 2), minval=1e-12,
+    uniforms = jax.random.uniform(keys["uniforms"], (intervals, is_constrained.shape[1], count // 2), minval=1e-12,
                                   maxval=1.0 - 1e-12)
-    normals = jax.random.normal(keys[1], (intervals, size, count // 2))
+    normals = jax.random.normal(keys["normals"], (intervals, size, count // 2))
     uniforms = jnp.concatenate([uniforms, 1.0 - uniforms], axis=-1)
     normals = jnp.concatenate([normals, -normals], axis=-1)
     rows = (forward_pass._replace(initial=None), is_constrained, uniforms, normals)

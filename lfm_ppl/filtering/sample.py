@@ -20,6 +20,8 @@ Source: Durbin and Koopman (2002), Biometrika 89(3); de Jong and Shephard (1995)
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import jax
 import jax.numpy as jnp
 
@@ -35,6 +37,7 @@ from lfm_ppl.utils.linalg import (
     solve_lower,
     solve_upper,
 )
+from lfm_ppl.utils.random_keys import split_by_name
 
 
 def sample_errors(key: jax.Array, trace: FilterTrace, draws: int) -> jax.Array:
@@ -45,16 +48,25 @@ def sample_errors(key: jax.Array, trace: FilterTrace, draws: int) -> jax.Array:
         trace: a forward pass with `Record.SMOOTHER`.
         draws: number of draws.
     """
+    keys = split_by_name(key, ("initial", "process", "observation", "backwards"))
     site_terms = trace.update.site_terms
-    if site_terms is not None:
-        is_negative = (site_terms.sites.tau < 0).any()
-        return jax.lax.cond(is_negative, lambda: _sample_backwards(key, trace, draws),
-                            lambda: sample_errors(key, _sites_as_observations(trace), draws))
+    if site_terms is None:
+        return _sample_by_simulation(keys, trace, draws)
+    is_negative = (site_terms.sites.tau < 0).any()
+    return jax.lax.cond(is_negative, lambda: _sample_backwards(keys["backwards"], trace, draws),
+                        lambda: _sample_by_simulation(keys, _sites_as_observations(trace), draws))
+
+
+def _sample_by_simulation(keys: Mapping[str, jax.Array], trace: FilterTrace, draws: int) -> jax.Array:
+    """Draw deviations as `sample_errors` does: simulate state and observations, subtract the smoothed simulation.
+
+    ``keys`` are random keys of "initial", "process" and "observation".
+    """
     rows, size = trace.phi.shape[:2]
     outputs = trace.update.innovation.shape[-1]
-    keys = jax.random.split(key, 3)
-    first = matmul(pivoted_root(trace.initial.covariance), jax.random.normal(keys[0], (size, draws)))
-    noises = jax.random.normal(keys[1], (rows, size, draws)), jax.random.normal(keys[2], (rows, outputs, draws))
+    first = matmul(pivoted_root(trace.initial.covariance), jax.random.normal(keys["initial"], (size, draws)))
+    noises = (jax.random.normal(keys["process"], (rows, size, draws)),
+              jax.random.normal(keys["observation"], (rows, outputs, draws)))
     roots = jax.vmap(pivoted_root)(trace.process_cov), jax.vmap(pivoted_root)(trace.update.obs_cov)
     intervals = trace._replace(initial=None)
 

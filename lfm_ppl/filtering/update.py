@@ -315,7 +315,7 @@ def multiply_by_sites(observation: LinearizedObservation, sites: Sites, predicte
     With f ~ N(m, F) as predicted and d = f - c,
 
         log \int N(f; m, F) prod_i t_i(f_i) df
-            = -log|I + T F| / 2 + nu'(m - c) - (m - c)'T(m - c) / 2 + b'F (I + T F)^-1 b / 2,    b = nu - T (m - c),
+            = -log|I + T F| / 2 + nu'(m + F s - c) / 2 + s'(m - c) / 2,    s = (I + T F)^-1 (nu - T (m - c)),
 
     and the covariance in Joseph's form, (I - K H) P (I - K H)' + P H' M T M' H P + K Omega K' with M = (I + T F)^-1
     and K = P H' M T. Nothing is divided by tau, which may be zero (nothing is observed) or negative.
@@ -345,7 +345,6 @@ def multiply_by_sites(observation: LinearizedObservation, sites: Sites, predicte
     filtered = Moments(mean + matvec(cross, score),
                        congruence(i_kh, covariance) + symmetric(matmul(gain_factor * sites.tau, gain_factor.T))
                        + congruence(gain, residual_cov))
-    log_integral = ((sites.nu - 0.5 * sites.tau * offset) * offset).sum() - 0.5 * log_det + 0.5 * (
-        slope * matvec(variance, score)).sum()
+    log_integral = 0.5 * ((sites.nu * (offset + matvec(variance, score)) + score * offset).sum() - log_det)
     terms = SiteTerms(observation.value, variance, residual_cov, shrinkage, precision, score, sites)
     return Update(filtered, log_integral, slope, gain, jacobian, site_terms=terms)

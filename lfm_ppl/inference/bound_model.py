@@ -27,11 +27,11 @@ from lfm_ppl.inference.likelihood_site import LikelihoodSite, likelihood_site, r
 from lfm_ppl.inference.model_arguments import ModelArguments, signature
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.inference.traced_model import TracedModel
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.programs import Program
+from lfm_ppl.utils.random_keys import split_keys
 
 _FORWARD_MODE_LIMIT = 3
 """Largest number of unconstrained parameters for which forward-mode gradients are faster."""

@@ -55,12 +55,12 @@ class UnusableModeError(ValueError):
     """Reason why the Laplace approximation does not describe the posterior; its text completes "since ..."."""
 
 
-def laplace_approximation(bound: BoundModel, seed: int) -> Laplace:
+def laplace_approximation(key: jax.Array, bound: BoundModel) -> Laplace:
     """Return the Laplace approximation of the posterior.
 
     Args:
+        key: random key of the starting points of the search.
         bound: the model and its data.
-        seed: of the starting points of the search.
 
     Raises:
         UnusableModeError: the search did not converge, the Hessian is not positive definite, or there are several
@@ -72,7 +72,7 @@ def laplace_approximation(bound: BoundModel, seed: int) -> Laplace:
     with warnings.catch_warnings():
         # The same conditions raise below, with a remedy that fits here.
         warnings.simplefilter("ignore")
-        result = mode_of(bound, seed=seed)
+        result = mode_of(key, bound)
     if result.unidentified:
         raise UnusableModeError(f"the posterior is flat at its mode along {', '.join(result.unidentified)}")
     if not np.all(np.isfinite(result.covariance)):

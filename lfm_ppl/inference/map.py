@@ -180,15 +180,15 @@ def map_estimate(
         )
     bound = bind_arguments(model, args, model_kwargs or {}, "map_estimate")
     exact = not bound.has_likelihood if hessian is None else hessian == "autodiff"
-    return mode_of(bound, init=init, restarts=restarts, seed=seed, jacobian=jacobian,
+    return mode_of(jax.random.key(seed), bound, init=init, restarts=restarts, jacobian=jacobian,
                    exact_hessian=exact, forward_mode=forward_mode, max_iterations=max_iterations)
 
 
-def mode_of(bound: BoundModel, *, init: Any = None, restarts: int = 4, seed: int = 0, jacobian: bool = True,
+def mode_of(key: jax.Array, bound: BoundModel, *, init: Any = None, restarts: int = 4, jacobian: bool = True,
             exact_hessian: bool = False, forward_mode: bool | None = None, max_iterations: int = 1000) -> MAPResult:
-    """Return the posterior mode of a bound model; arguments as in `map_estimate`."""
+    """Return the posterior mode of a bound model, from starts drawn by a key; arguments as in `map_estimate`."""
     objective = bound.objective(jacobian, forward_mode, exact_hessian)
-    starts = _starts(bound, jax.random.key(seed), objective.value, init, restarts)
+    starts = _starts(bound, key, objective.value, init, restarts)
     no_end = End(np.full(bound.size, np.nan), np.inf)
     search_ends = [no_end if start is None else quasi_newton(objective, start, max_iterations, options=_SEARCH)
                    for start in starts]

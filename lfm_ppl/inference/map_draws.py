@@ -20,11 +20,11 @@ import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.utils.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
 from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.progress import Progress, Reporter
+from lfm_ppl.utils.random_keys import split_keys
 
 _SEQUENTIAL_BATCH = 8
 """Draws in a batch of draws that go one after another."""

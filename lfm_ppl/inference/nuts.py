@@ -101,7 +101,7 @@ def nuts(bound: BoundModel, num_warmup: int, options: Mapping[str, Any]) -> Samp
     def step(state: NUTSState, y: Any) -> NUTSState:
         kernel, hmc = kernel_at(y), state.hmc
         # `init` builds the functions of the kernel. Its state is not used, and the compiler removes it.
-        kernel.init(hmc.rng_key, num_warmup, ParamInfo(hmc.z, hmc.potential_energy, hmc.z_grad), (), {})
+        kernel.init(jax.random.key(0), num_warmup, ParamInfo(hmc.z, hmc.potential_energy, hmc.z_grad), (), {})
         return NUTSState(_with_pseudo_draws(kernel.sample(hmc, (), {}), state.laplace), state.laplace)
 
     return SamplingAlgorithm(init, step, _summary)

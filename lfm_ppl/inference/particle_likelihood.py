@@ -168,8 +168,8 @@ class ParticlePotential:
         Source: Doucet, Pitt, Deligiannidis and Kohn (2015), Biometrika 102(2).
         """
         particles = 200
-        for attempt in range(8):
-            sd = self.sd_of_estimates(z, jax.random.fold_in(key, attempt), particles)
+        for attempt_key in jax.random.split(key, 8):
+            sd = self.sd_of_estimates(z, attempt_key, particles)
             needed_particles = int(np.ceil(particles * np.clip(sd**2, 1 / 64, 8.0)))
             is_close = particles / 1.4 < needed_particles < particles * 1.4
             if is_close or (particles == _FEWEST and needed_particles <= _FEWEST):

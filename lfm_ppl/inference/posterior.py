@@ -33,6 +33,7 @@ from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
 from lfm_ppl.utils.linalg import semidefinite_root
 from lfm_ppl.utils.progress import Reporter
+from lfm_ppl.utils.random_keys import split_by_name
 
 _FILTERS = 4
 """Number of particle filters from which the path of one draw is chosen."""
@@ -44,11 +45,12 @@ LOG_PRIOR = "log prior of "
 """Start of the names of the log prior densities among the scores."""
 
 
-def scores(bound: BoundModel, draws: Mapping[str, Any], *,
+def scores(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], *,
            report: Reporter | None = None, store: BatchStore | None = None) -> Any:
     """Score the observations under each draw.
 
     Args:
+        key: a JAX random key, for likelihoods that draw a further parameter, such as a path of regimes.
         bound: the model and its data.
         draws: site name -> (S, ...).
         report: as in `map_draws`.
@@ -66,7 +68,7 @@ def scores(bound: BoundModel, draws: Mapping[str, Any], *,
         keys = jax.random.split(key, y.shape[0]) if isinstance(distribution, Panel) else key
         return map_series(distribution, lambda series, y, key: series.scores(key, y), y, keys) | log_priors
 
-    return map_draws(bound, "scores", SharedFunction(per_draw), draws, jax.random.key(0), rows=bound.times.size,
+    return map_draws(bound, "scores", SharedFunction(per_draw), draws, key, rows=bound.times.size,
                      report=report, store=store)
 
 
@@ -120,11 +122,11 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     def draw_series(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array, path_times: Any = plan.times,
                     layout: GridLayout | None = None) -> dict[str, jax.Array]:
         ssm = distribution.ssm
-        path_key, noise_key = jax.random.split(key)
+        keys = split_by_name(key, ("path", "replicate", "forecast", "points", "prediction"))
         results: dict[str, jax.Array] = {}
         if particles is None and not distribution.has_gaussian_state:
             smoothed = None
-            w, when = distribution.sample_path(path_key, y, path_times)
+            w, when = distribution.sample_path(keys["path"], y, path_times)
         elif particles is None:
             reached = layout or path_times
             if layout is None and is_forecast and path_times is not None:
@@ -132,31 +134,30 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
                 reached = minimum(path_times, distribution.times[-1] if plan.is_of_series else bound.times.max())
             smoothed = distribution.smooth(y, reached, plan.smoother_steps)
             when = smoothed.times if path_times is None else jnp.asarray(path_times, float)
-            states = smoothed.sample_joint(path_key, 1)[0]
+            states = smoothed.sample_joint(keys["path"], 1)[0]
             is_smoothed = jnp.ones((len(when), 1), bool)
             if is_forecast:
                 is_smoothed = (when <= _last_observed(y, when, plan))[:, None]
-                forecast_key = jax.random.fold_in(path_key, 1)
-                states = _simulate_forecast(distribution, states, when, is_smoothed[:, 0], plan, forecast_key)
+                states = _simulate_forecast(distribution, states, when, is_smoothed[:, 0], plan, keys["forecast"])
             w = jax.vmap(ssm.inputs)(states, when)
             results = _moments(ssm, smoothed, w, is_smoothed, plan)
             gaussian = not (isinstance(ssm.model.observation, ObservationFamily) or noise_of_rows(distribution))
-            results |= _points(ssm, smoothed, w, when, is_smoothed, plan, jax.random.fold_in(path_key, 2), gaussian)
+            results |= _points(ssm, smoothed, w, when, is_smoothed, plan, keys["points"], gaussian)
             results |= {"log_likelihood": smoothed.log_likelihood.sum()}
         else:
             smoothed = None
-            w, when = _particle_path(distribution, y, path_times, path_key, particles,
+            w, when = _particle_path(distribution, y, path_times, keys["path"], particles,
                                      particle_steps or plan.smoother_steps or distribution.steps)
         requested, data = plan.requested, plan.data
         results["deterministic"] = jax.vmap(ssm.deterministics)(w[requested], when[requested])
         if isinstance(ssm.model.observation, ObservationFamily):
-            results |= _of_family(ssm, noise_key, w, when, plan)
+            results |= _of_family(ssm, keys, w, when, plan)
             if at is not None and noise_of_rows(distribution):
                 del results["prediction"]
             return results
         output = jax.vmap(ssm.observe)(w, when)
         covariance = jax.vmap(ssm.obs_cov)(w[data], when[data], jnp.arange(len(data)))
-        replicated = with_noise(noise_key, output[data], covariance)
+        replicated = with_noise(keys["replicate"], output[data], covariance)
         size = ssm.physical_dim
         results |= {"state": w[requested, :size], "force": w[requested, size:], "output": output[requested],
                     "y": replicated}
@@ -175,7 +176,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         prediction = replicated
         if at is not None:
             covariance = jax.vmap(ssm.obs_cov)(w[requested], when[requested], jnp.zeros(len(requested), int))
-            prediction = with_noise(jax.random.fold_in(noise_key, 1), output[requested], covariance)
+            prediction = with_noise(keys["prediction"], output[requested], covariance)
         noise = jnp.diagonal(covariance, axis1=1, axis2=2)
         return results | {"prediction": prediction, "predictive_sd": jnp.sqrt(variance + noise)}
 
@@ -205,17 +206,20 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     return map_draws(bound, (*name, signature(at)), per_draw, draws, key, rows=rows, **options)
 
 
-def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Array,
+def _of_family(ssm: StateSpaceModel, keys: Mapping[str, jax.Array], w: jax.Array, when: jax.Array,
                plan: PathPlan) -> dict[str, jax.Array]:
-    """Return outputs, replicated data and predictions along one path (L, M + R), for an observation family."""
+    """Return outputs, replicated data and predictions along one path (L, M + R), for an observation family.
+
+    ``keys`` are random keys of "replicate" and "prediction".
+    """
     size, requested, data = ssm.physical_dim, plan.requested, plan.data
     output = jax.vmap(lambda w, t: expected_observation(ssm, w, t))(w[requested], when[requested])
     replicated = jax.vmap(lambda w, t, key, row: noisy_observation(ssm, w, t, key, row))(
-        w[data], when[data], jax.random.split(key, len(data)), jnp.arange(len(data)))
+        w[data], when[data], jax.random.split(keys["replicate"], len(data)), jnp.arange(len(data)))
     prediction = replicated
     if plan.times is not None:
         prediction = jax.vmap(lambda w, t, key: noisy_observation(ssm, w, t, key, None))(
-            w[requested], when[requested], jax.random.split(jax.random.fold_in(key, 1), len(requested)))
+            w[requested], when[requested], jax.random.split(keys["prediction"], len(requested)))
     return {"state": w[requested, :size], "force": w[requested, size:], "output": output, "y": replicated,
             "prediction": prediction}
 
@@ -309,8 +313,9 @@ def _particle_path(distribution: SeriesLikelihood, y: jax.Array, requested_times
     """
     ssm, times = distribution.ssm, distribution.times
     grid = build_time_grid(ssm, times, steps, distribution.max_step, requested_times)
-    path_keys, choice = jax.random.split(key, _FILTERS + 1)[:-1], jax.random.fold_in(key, _FILTERS)
-    states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, grid, y, k, particles, 1, TRACING), path_keys)
-    best = jax.random.categorical(choice, jnp.where(jnp.isneginf(total).all(), 0.0, total))
+    keys = split_by_name(key, ("filters", "choice"))
+    states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, grid, y, k, particles, 1, TRACING),
+                                   jax.random.split(keys["filters"], _FILTERS))
+    best = jax.random.categorical(keys["choice"], jnp.where(jnp.isneginf(total).all(), 0.0, total))
     when = jnp.asarray(grid.requested_times, float)
     return jax.vmap(ssm.inputs)(states[best][:, 0], when), when

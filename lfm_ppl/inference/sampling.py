@@ -25,12 +25,12 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpyro.infer.util import ParamInfo
 
 from lfm_ppl.inference.bound_samplers import BoundSampler
-from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.interruption import Interruption, was_interrupt
 from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.progress import Console, Progress
+from lfm_ppl.utils.random_keys import split_keys
 
 CHAIN_METHODS = ("parallel", "vectorized", "sequential")
 

@@ -14,7 +14,7 @@ Source: Kloeden and Platen (1992), Numerical Solution of Stochastic Differential
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -29,6 +29,7 @@ from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.model.state_space import Span, StateSpaceModel, check_times, state_space
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import matmul, semidefinite_root
+from lfm_ppl.utils.random_keys import split_by_name
 
 
 class Simulation(NamedTuple):
@@ -241,11 +242,11 @@ def _interval_integrator(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.
         span = Span.between(start, end, end - start)
 
         def step(state: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
-            step_key = jax.random.fold_in(interval_key, index)
-            state = _simulation_step(ssm, state, span.shifted(index * h), h, transition, root, step_key)
+            keys = split_by_name(jax.random.fold_in(interval_key, index), ("forces", "process noise", "jumps"))
+            state = _simulation_step(ssm, state, span.shifted(index * h), h, transition, root, keys)
             # The last step must end exactly at the end of the interval, so that a jump there is crossed once.
             step_end = jnp.where(index == steps - 1, end, start + (index + 1) * h)
-            return _cross_jumps(ssm, jumps, state, start + index * h, step_end, step_key), None
+            return _cross_jumps(ssm, jumps, state, start + index * h, step_end, keys["jumps"]), None
 
         return jax.lax.scan(step, state, jnp.arange(steps))[0]
 
@@ -253,14 +254,14 @@ def _interval_integrator(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.
 
 
 def _simulation_step(ssm: StateSpaceModel, state: jax.Array, span: Span, h: jax.Array, transition: jax.Array,
-                     root: jax.Array, key: jax.Array) -> jax.Array:
+                     root: jax.Array, keys: Mapping[str, jax.Array]) -> jax.Array:
     """Return the joint state (n,) after one integration step of length h from the start of ``span``.
 
-    ``transition`` is that of the forces over the step, ``root`` a square root of their process noise.
+    ``transition`` is that of the forces over the step, ``root`` a square root of their process noise; ``keys`` are
+    random keys of "forces" and "process noise".
     """
     size = ssm.physical_dim
-    force_key, state_key = jax.random.split(key)
-    white_noise = jax.random.normal(force_key, (ssm.force_dim, 1))
+    white_noise = jax.random.normal(keys["forces"], (ssm.force_dim, 1))
     forces = (matmul(transition, state[size:, None]) + matmul(root, white_noise))[:, 0]
 
     x, t = state[:size], span.time()
@@ -269,7 +270,8 @@ def _simulation_step(ssm: StateSpaceModel, state: jax.Array, span: Span, h: jax.
     dispersion = ssm.dispersion(inputs, t)
     noise = jnp.zeros(size)
     if dispersion is not None:
-        noise = jnp.sqrt(h) * matmul(dispersion, jax.random.normal(state_key, (dispersion.shape[1], 1)))[:, 0]
+        white_noise = jax.random.normal(keys["process noise"], (dispersion.shape[1], 1))
+        noise = jnp.sqrt(h) * matmul(dispersion, white_noise)[:, 0]
     end = span.time(h)
     midpoint_forces = 0.5 * (state[size:] + forces)
 
@@ -292,13 +294,14 @@ def _cross_jumps(ssm: StateSpaceModel, jumps: Any, state: jax.Array, start: jax.
     crossed = (times > start) & (times <= end)
 
     def apply_jump(forces: jax.Array, jump: tuple) -> tuple[jax.Array, None]:
-        is_crossed, index, transition, root = jump
-        white_noise = jax.random.normal(jax.random.fold_in(key, index + 1), (ssm.force_dim, 1))
+        is_crossed, jump_key, transition, root = jump
+        white_noise = jax.random.normal(jump_key, (ssm.force_dim, 1))
         jumped = (matmul(transition, forces[:, None]) + matmul(root, white_noise))[:, 0]
         return jnp.where(is_crossed, jumped, forces), None
 
     def apply_jumps(forces: jax.Array) -> jax.Array:
-        return jax.lax.scan(apply_jump, forces, (crossed, jnp.arange(len(times)), *(a[:-1] for a in jumps)))[0]
+        keys = jax.random.split(key, len(times))
+        return jax.lax.scan(apply_jump, forces, (crossed, keys, *(a[:-1] for a in jumps)))[0]
 
     forces = jax.lax.cond(crossed.any(), apply_jumps, lambda forces: forces, state[size:])
     return jnp.concatenate([state[:size], forces])

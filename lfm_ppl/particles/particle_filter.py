@@ -33,6 +33,7 @@ from lfm_ppl.particles.resampling import RESAMPLING, effective_sample_size, resa
 from lfm_ppl.particles.stochastic_steps import ParticleTransition, StepConstants, choose_scheme, initial_particles
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.programs import shared_jit
+from lfm_ppl.utils.random_keys import split_by_name
 
 
 class ParticleSettings(NamedTuple):
@@ -216,13 +217,13 @@ def filter_particles(ssm: StateSpaceModel, grid: TimeGrid, y: jax.Array, key: ja
     def step(carry: tuple[jax.Array, jax.Array], inputs: tuple[Intervals, jax.Array, jax.Array]) -> tuple[tuple, Any]:
         state, log_weights = carry
         interval, y_row, row_key = inputs
-        # Two keys are used; three are split so that existing seeds keep their random numbers.
-        keys = jax.random.split(row_key, 3)
+        keys = split_by_name(row_key, ("move", "resampling"))
         constants = transition.step_constants(interval)
         state, log_density = _in_batches(
-            lambda k, s: _move_and_score(transition, constants, interval, y_row, k, s), keys[0], state, settings.batch)
-        state, log_weights, record = _reweight_and_resample(settings, keys[1], state, log_weights, log_density,
-                                                            interval.observation >= 0)
+            lambda k, s: _move_and_score(transition, constants, interval, y_row, k, s), keys["move"], state,
+            settings.batch)
+        state, log_weights, record = _reweight_and_resample(settings, keys["resampling"], state, log_weights,
+                                                            log_density, interval.observation >= 0)
         return (state, log_weights), summarize(record)
 
     start = (state, jnp.full(count, -np.log(count)))

@@ -377,7 +377,7 @@ def _sample(problem: FitProblem, store: Checkpoint | None, show_progress: bool) 
             store.setup = start.setup
         store.write_partial = _partial_result_writer(problem, attributes, store)
     schedule = Schedule(start.attributes["warmup"] * options.thin, options.samples, options.thin, options.chain_method)
-    chains = sampling.run_chains(options.chain_key, start.sampler, start.points, schedule, store, show_progress)
+    chains = sampling.run_chains(options.keys["chains"], start.sampler, start.points, schedule, store, show_progress)
     count = chains.z.shape[1]
     if count == 0:
         raise KeyboardInterrupt(f"stopped in the warm-up, after {chains.done:,} of {chains.total:,} steps; there are "
@@ -427,12 +427,12 @@ def _draw_about_mode(problem: FitProblem, store: Checkpoint | None, show_progres
         check_init(options.init)
 
     def compute() -> dict[str, Any]:
-        mode = mode_of(bound, seed=options.seed, init=None if isinstance(options.init, str) else options.init)
+        mode = mode_of(options.keys["mode"], bound, init=None if isinstance(options.init, str) else options.init)
         attributes = {"map_converged": int(mode.converged), "map_message": mode.message,
                       "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence),
                       arviz_data.MODE: json.dumps({name: value.tolist() for name, value in
                                                    {**mode.parameters, **mode.deterministic}.items()})}
-        draws = mode.sample(options.chain_key, options.samples)
+        draws = mode.sample(options.keys["chains"], options.samples)
         degenerate = best_effort("check of the mode", lambda: degenerate_entries(bound, mode, draws), {})
         attributes |= {arviz_data.DEGENERATE: json.dumps(degenerate)} if degenerate else {}
         return {"": np.asarray(json.dumps(attributes)), **draws}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import json
 import warnings
@@ -20,6 +21,12 @@ from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.results import run_record
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.random_keys import split_by_name
+
+
+def keys_of(seed: int) -> dict[str, jax.Array]:
+    """Return the random keys of a seed: one for each part of a fit, and one for the forecasts of its result."""
+    return split_by_name(jax.random.key(seed), ("mode", "chains", "starts", "trajectories", "scores", "forecasts"))
 
 
 @dataclass(frozen=True)
@@ -54,23 +61,10 @@ class FitOptions:
     sampler_options: dict[str, Any]
     chain_method: str | None
 
-    def _key(self, index: int) -> jax.Array:
-        return jax.random.split(jax.random.key(self.seed), 5)[index]
-
-    @property
-    def chain_key(self) -> jax.Array:
-        """Random key of the chains."""
-        return self._key(1)
-
-    @property
-    def start_key(self) -> jax.Array:
-        """Random key of the starting points."""
-        return self._key(2)
-
-    @property
-    def trajectory_key(self) -> jax.Array:
-        """Random key of the trajectories."""
-        return self._key(3)
+    @functools.cached_property
+    def keys(self) -> dict[str, jax.Array]:
+        """Random keys by purpose, see `keys_of`."""
+        return keys_of(self.seed)
 
     def description(self, bound: BoundModel) -> dict[str, Any]:
         """Return the attributes of the result on the likelihood and the sampler."""

@@ -40,6 +40,7 @@ from lfm_ppl.results.predictions import SHOWN_PERIODS, repeats_often
 from lfm_ppl.results.sites import merge_sites
 from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
+from lfm_ppl.utils.random_keys import split_by_name
 from lfm_ppl.workflows.fit_options import FitOptions, versions
 
 ONLY_DRAWS = "all draws, without scores and trajectories"
@@ -162,9 +163,10 @@ def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint |
         processed.warnings += [f"site {name}: {text}" if problem.bound.is_by_site else text for text in messages]
 
     try:
+        score_keys = split_by_name(options.keys["scores"], problem.sites)
         for name, site in problem.sites.items():
             processed.scores[name] = best_effort(label("scores of the observations", name), partial(
-                scores, site.bound, values, **batch_options(label("scores", name))), None)
+                scores, score_keys[name], site.bound, values, **batch_options(label("scores", name))), None)
         processed.attributes = _site_attributes(problem, draws, values)
         for name, site in problem.sites.items():
             warn(name, best_effort(label("resolution of the forces", name),
@@ -173,10 +175,10 @@ def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint |
                 log_likelihood = _log_likelihood(site.bound, processed.scores[name])
                 warn(name, best_effort(label("error of the likelihood", name), partial(
                     approximation_warnings, site.bound, values, log_likelihood), []))
-        for index, (name, site) in enumerate(problem.sites.items()):
-            key = jax.random.fold_in(options.trajectory_key, index) if index else options.trajectory_key
+        path_keys = split_by_name(options.keys["trajectories"], problem.sites)
+        for name, site in problem.sites.items():
             processed.trajectories[name] = best_effort(label("trajectories", name), partial(
-                draw_paths, key, site.bound, draws.values, site.requested_times, options.trajectory_draws,
+                draw_paths, path_keys[name], site.bound, draws.values, site.requested_times, options.trajectory_draws,
                 **draws.particle_options, **batch_options(label("trajectories", name))), TrajectoryDraws())
     except KeyboardInterrupt:
         has_scores = all(processed.scores.get(name) is not None for name in problem.sites)

@@ -29,8 +29,8 @@ from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tun
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.laplace_start import Laplace, UnusableModeError, laplace_approximation, starting_points
 from lfm_ppl.inference.map import MAPResult, mode_of
-from lfm_ppl.inference.random_keys import split_keys
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.random_keys import split_keys
 from lfm_ppl.workflows.fit_options import FitOptions
 
 FALLBACK = "init_fallback"
@@ -98,7 +98,7 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
     is_at_mode = options.init in (None, "map")
     if is_at_mode:
         try:
-            laplace = laplace_approximation(bound, options.seed)
+            laplace = laplace_approximation(options.keys["mode"], bound)
         except UnusableModeError as error:
             fallback = {FALLBACK: f"the chains start at the prior median, with a unit mass matrix: {error}"}
     default_warmup = _SHORT_WARMUP if laplace is not None and is_regularized else _WARMUP
@@ -107,7 +107,7 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
     if is_at_mode:  # the advice for a slow warm-up is to start there
         nuts = dataclasses.replace(nuts, slow_warmup_hint="")
     if laplace is not None:
-        points = starting_points(options.start_key, bound, laplace, options.chains)
+        points = starting_points(options.keys["starts"], bound, laplace, options.chains)
         return ChainStart(nuts, points, {"warmup": warmup, "init": "laplace"})
     strategy = init_to_median if is_at_mode else _strategy(bound, options)
     points = _starting_points(bound, options, strategy, nuts.evaluate)
@@ -127,7 +127,7 @@ def _find_random_walk_start(bound: BoundModel, options: FitOptions, setup: Mappi
     if "initial_covariance" not in sampler_options:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            mode = mode_of(bound, seed=options.seed, restarts=2)
+            mode = mode_of(options.keys["mode"], bound, restarts=2)
         if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
             mode = None
     if mode is not None:
@@ -162,20 +162,20 @@ def _strategy(bound: BoundModel, options: FitOptions) -> Callable:
     if options.init is None or isinstance(options.init, str) and options.init == "median":
         return init_to_median
     if isinstance(options.init, str):
-        return init_to_value(values=mode_of(bound, seed=options.seed).parameters)
+        return init_to_value(values=mode_of(options.keys["mode"], bound).parameters)
     return options.init
 
 
 def _starting_points(bound: BoundModel, options: FitOptions, strategy: Callable, evaluate: Callable) -> np.ndarray:
     """Return one point (C, d) for each chain, by a NumPyro strategy, where ``evaluate`` returns finite values."""
-    keys = split_keys(options.start_key, options.chains)
+    keys = split_keys(options.keys["starts"], options.chains)
     return np.stack([bound.start(keys(chain), strategy, evaluate=evaluate) for chain in range(options.chains)])
 
 
 def _draws_about_mode(bound: BoundModel, options: FitOptions, mode: MAPResult) -> np.ndarray:
     """Return draws (C, d) from the Laplace approximation; the mode itself where the density of a draw is zero."""
     root = np.linalg.cholesky(mode.covariance)
-    normals = np.asarray(jax.random.normal(options.start_key, (options.chains, bound.size)))
+    normals = np.asarray(jax.random.normal(options.keys["starts"], (options.chains, bound.size)))
     points = mode.mode + normals @ root.T
     is_possible = [bool(np.isfinite(bound.log_density_gradient(point)[0])) for point in points]
     return np.where(np.array(is_possible)[:, None], points, mode.mode)

@@ -21,8 +21,10 @@ from lfm_ppl.results.series import series_dimension
 from lfm_ppl.results.sites import select_site
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import Console
+from lfm_ppl.utils.random_keys import split_by_name
 from lfm_ppl.utils.types import Result, Times
 from lfm_ppl.workflows.data_binding import check_requested_times, of_site
+from lfm_ppl.workflows.fit_options import keys_of
 
 
 def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: Mapping[str, Any] | None = None,
@@ -107,11 +109,11 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
     with calendar_time.in_messages(*next(iter(clocks.values()))):
         problem = rebuilding.problem(result, numpyro_model, model_kwargs=keywords)
     groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)}
-    for index, name in enumerate(requested):
-        key = jax.random.fold_in(jax.random.key(seed), index) if index else jax.random.key(seed)
+    keys = split_by_name(keys_of(seed)["forecasts"], requested)
+    for name in requested:
         suffix = f"_{name.replace('/', '.')}" if sites else ""
         with calendar_time.in_messages(*clocks[name]):
-            new = _forecast(key, views[name], problem.sites[name] if sites else problem, requested[name],
+            new = _forecast(keys[name], views[name], problem.sites[name] if sites else problem, requested[name],
                             later[name] if sites else later, draws, progress)
         # Held-out data of an earlier forecast do not belong to this one.
         for group in (HELD_OUT, known_inputs.FORECAST):

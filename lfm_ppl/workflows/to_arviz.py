@@ -23,9 +23,10 @@ from lfm_ppl.inference.posterior import scores
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.layout import Labels, TrajectoryDraws, checked_truth
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.random_keys import split_by_name
 from lfm_ppl.utils.types import Result
 from lfm_ppl.workflows.data_binding import check_requested_times, coords_of_site, of_site
-from lfm_ppl.workflows.fit_options import likelihood_settings, model_docstring, versions
+from lfm_ppl.workflows.fit_options import keys_of, likelihood_settings, model_docstring, versions
 from lfm_ppl.workflows.fit_results import (
     ConvergenceWarning,
     PostProcessing,
@@ -107,17 +108,19 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: ArrayLike, y: ArrayLike,
     chains, samples = next(iter(draws.values())).shape[:2]
     flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}
     sites, processed = {}, PostProcessing()
-    for index, (site, model) in enumerate(bound.site_models.items()):
+    keys = keys_of(seed)
+    score_keys, path_keys = (split_by_name(keys[name], bound.site_models) for name in ("scores", "trajectories"))
+    for site, model in bound.site_models.items():
         names = list(bound.site_models) if bound.is_by_site else []
         site_at, site_truth = of_site("at", at, site, names), of_site("truth", truth, site, names)
         check_requested_times(model, site_at)
         labels = Labels.of(model, dims, coords_of_site(coords, site, names), None if names else y)
         sites[site] = SiteProblem(model, labels, site_at, truth=checked_truth(model, site_truth, labels),
                                   description=likelihood_settings(model.site.example))
-        processed.scores[site] = best_effort("scores of the observations", partial(scores, model, flat), None)
-        key = jax.random.fold_in(jax.random.key(seed), index) if index else jax.random.key(seed)
+        processed.scores[site] = best_effort("scores of the observations", partial(
+            scores, score_keys[site], model, flat), None)
         processed.trajectories[site] = best_effort("trajectories", partial(
-            draw_paths, key, model, draws, site_at, trajectory_draws), TrajectoryDraws())
+            draw_paths, path_keys[site], model, draws, site_at, trajectory_draws), TrajectoryDraws())
     groups, site_attributes = lay_out_sites(bound, sites, draws, stats, processed)
     kernel = getattr(mcmc, "sampler", None)
     attrs = {

@@ -10,7 +10,7 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 from references import matern
-from scipy import stats
+from scipy import special, stats
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering.ep.importance import importance_weights
@@ -252,6 +252,75 @@ def test_sites_that_do_not_converge_are_minus_infinity_with_a_finite_gradient_an
         assert likelihood("Student-t", THETA, short).log_prob(y) == -np.inf
     value, gradient = jax.jit(jax.value_and_grad(lambda th: likelihood("Student-t", th, short).log_prob(y)))(THETA)
     assert value == -np.inf and np.all(gradient == 0.0)
+
+
+INVERSE_LINKS = {"exp": np.log, "softplus": lambda rate: rate + np.log(-np.expm1(-rate)), "identity": lambda rate: rate}
+LOG_RATES = {"exp": lambda f: f, "softplus": lambda f: np.log(np.logaddexp(0.0, f)),
+             "identity": lambda f: np.log(np.maximum(f, 1e-300))}
+
+
+def log_evidence_of_a_count(link, y, mean, sd):
+    """Return log int N(f; mean, sd^2) Poisson(y; g(f)) df by Gauss-Legendre panels about the largest integrand."""
+
+    def log_integrand(f):
+        log_ratio = LOG_RATES[link](f) - np.log(max(y, 1.0))
+        constant = -special.gammaln(y + 1.0) if y < 100 else -0.5 * np.log(2 * np.pi * y) - 1 / (12 * y) + 1 / (
+            360 * y**3)
+        count = (y * log_ratio + y * np.log(max(y, 1.0)) - np.exp(LOG_RATES[link](f)) if y < 100
+                 else y * (log_ratio - np.expm1(log_ratio)))
+        return np.where((f > 0) | (link != "identity"), constant + count, -np.inf) + stats.norm.logpdf(f, mean, sd)
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        guess = INVERSE_LINKS[link](max(y, 0.7))
+        low, high = min(mean, guess) - 40 * sd, max(mean, guess) + 40 * sd
+        for _ in range(40):  # to where the integrand is not negligible
+            grid = np.linspace(low, high, 2001)
+            values = log_integrand(grid)
+            rows = np.flatnonzero(values > values.max() - 50)
+            low, high = grid[max(rows[0] - 1, 0)], grid[min(rows[-1] + 1, 2000)]
+        edges = np.linspace(low, high, 2001)
+        nodes, weights = np.polynomial.legendre.leggauss(8)
+        half = 0.5 * np.diff(edges)[:, None]
+        values = log_integrand(edges[:-1, None] + half * (1 + nodes))
+        return values.max() + np.log((np.exp(values - values.max()) * weights * half).sum())
+
+
+@pytest.mark.parametrize("link", INVERSE_LINKS)
+def test_evidence_of_counts_of_any_size(link):
+    """One count whose predictor has a prior near it or far off: value, and gradient by differences of the reference."""
+
+    def log_prob(mean, sd, y):
+        model = lfm.LatentForceModel(lambda x, u, t: 0.0 * x, {}, lfm.PoissonObservation(lambda x, u, t: x, link),
+                                     lfm.Gaussian(mean[None], sd[None, None] ** 2))
+        return lfm.MarginalLikelihood(model, np.zeros(1)).log_prob(y[None, None])
+
+    cases = []
+    for y in (0.0, 3.0, 40.0, 3e7, 1e8, 1e12):
+        centre, width = INVERSE_LINKS[link](max(y, 0.7)), 1.0 if link == "exp" else np.sqrt(max(y, 1.0))
+        cases += [(centre - 0.5 * sd * width, sd * width, y) for sd in (1e-3, 0.3, 1.0)]
+    cases += [(0.0, 3.0, 1e8), (17.92068, 1.0, 1e8), (60.0, 10.0, 1e8)] if link == "exp" else [(2e8, 3e7, 1e8)]
+    mean, sd, y = map(jnp.asarray, np.transpose(cases))
+    value, slope = jax.jit(jax.vmap(jax.value_and_grad(log_prob)))(mean, sd, y)
+    step = 1e-4
+    below, expected, above = (np.array([log_evidence_of_a_count(link, y, m + move * s, s) for m, s, y in cases])
+                              for move in (-step, 0.0, step))
+    np.testing.assert_allclose(value, expected, atol=2e-8)
+    np.testing.assert_allclose(slope * sd, (above - below) / (2 * step), rtol=1e-5, atol=1e-5)
+
+
+def test_a_series_of_large_counts():
+    """Two scales of counts of one force: the evidence of 1e8 counts is that of Gaussian logarithms, to O(1e-8)."""
+    times, rng = np.linspace(0.0, 3.0, 8), np.random.default_rng(0)
+    y = rng.poisson(1e8 * np.exp(np.sin(times)))[:, None].astype(float)
+
+    def likelihood(observation):
+        model = lfm.LatentForceModel(lambda x, u, t: jnp.zeros(0), {"u": lfm.Matern(1.0, 1.0)}, observation,
+                                     lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
+        return lfm.MarginalLikelihood(model, times)
+
+    counts = likelihood(lfm.PoissonObservation(lambda x, u, t: u + np.log(1e8))).log_prob(y)
+    gaussian = likelihood(lfm.GaussianObservation(lambda x, u, t: u, 1.0 / y[:, :, None])).log_prob(np.log(y / 1e8))
+    np.testing.assert_allclose(counts, gaussian - np.log(y).sum(), atol=1e-5)
 
 
 def test_settings_of_the_sites_are_checked():

@@ -32,7 +32,7 @@ def gaussian():
 
 
 def test_the_approximation_of_a_gaussian_is_the_gaussian():
-    laplace = laplace_approximation(bound(gaussian), seed=0)
+    laplace = laplace_approximation(jax.random.key(0), bound(gaussian))
     assert_allclose(laplace.mode, [1.0, -2.0], atol=1e-6)
     assert_allclose(laplace.covariance, COVARIANCE, rtol=1e-5)
 
@@ -55,7 +55,7 @@ def many():
 @pytest.mark.parametrize("model, name", [(two_modes, "mode"), (flat, "x, y"), (many, str(MAX_PARAMETERS + 1))])
 def test_a_mode_that_does_not_describe_the_posterior_is_refused(model, name):
     with pytest.raises(UnusableModeError, match=name):
-        laplace_approximation(bound(model), seed=0)
+        laplace_approximation(jax.random.key(0), bound(model))
 
 
 def test_starting_points_have_twice_the_standard_deviation():

@@ -1,5 +1,8 @@
 """Observation families: densities against SciPy, draws against densities, and errors of data and parameters."""
 
+import math
+from decimal import Decimal, localcontext
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -66,6 +69,37 @@ def test_log_prob(name):
     family, y, expected = CASES[name]
     np.testing.assert_allclose(family.log_prob(jnp.asarray(PREDICTOR), jnp.asarray(y)), expected(y, PREDICTOR),
                                rtol=1e-11)
+
+
+def log_factorial(n):
+    """Return log n! of a large number, with sixty digits."""
+    n = Decimal(n)
+    return n * n.ln() - n + (2 * Decimal(f"{math.pi:.60f}") * n).ln() / 2 + 1 / (12 * n) - 1 / (360 * n**3)
+
+
+@pytest.mark.parametrize("y", [3e7, 1e8, 1e12])
+@pytest.mark.parametrize("distance", [-2.0, 0.0, 0.7])
+def test_log_prob_of_large_counts(y, distance):
+    """In exact arithmetic at a predictor some standard deviations from the count; it may be rounded by an ulp."""
+    with localcontext(prec=60):
+        count, concentration, trials = Decimal(y), Decimal(y / 4), Decimal(4 * y)
+        f = np.log(y) + distance / np.sqrt(y)
+        mean = Decimal(f).exp()
+        poisson = count * Decimal(f) - mean - log_factorial(y)
+        overdispersed = (log_factorial(y + y / 4 - 1) - log_factorial(y / 4 - 1) - log_factorial(y)
+                         + concentration * (concentration / (concentration + mean)).ln()
+                         + count * (mean / (concentration + mean)).ln())
+        logit = np.log(1 / 3) + distance / np.sqrt(y)
+        share = 1 / (1 + (-Decimal(logit)).exp())
+        binomial = (log_factorial(4 * y) - log_factorial(y) - log_factorial(3 * y) + count * share.ln()
+                    + (trials - count) * (1 - share).ln())
+    rounding = 1e-11 + 4e-15 * np.log(y) * np.sqrt(y) * abs(distance)
+    for family, predictor, expected in (
+            (lfm.PoissonObservation(state), f, poisson), (lfm.PoissonObservation(state, "identity"), np.exp(f), None),
+            (lfm.NegativeBinomialObservation(state, y / 4), f, overdispersed),
+            (lfm.BinomialObservation(state, 4 * y), logit, binomial)):
+        value = float(family.log_prob(jnp.array([predictor]), jnp.array([y]))[0])
+        assert abs(value - float(expected or poisson)) < rounding, type(family).__name__
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if "Student" not in name])

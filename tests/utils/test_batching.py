@@ -88,7 +88,7 @@ def test_an_interruption_between_two_batches_ends_the_others(two_cpus):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        scores(bound, {"noise": np.linspace(0.5, 0.8, count)}, store=Kept())
+        scores(jax.random.key(0), bound, {"noise": np.linspace(0.5, 0.8, count)}, store=Kept())
     assert list(kept) == [0] and not [one for one in threading.enumerate() if "side by side" in one.name]
 
 
@@ -112,7 +112,7 @@ def test_draws_are_shared_out_to_the_threads_with_the_same_numbers(two_cpus, mon
     bound, count = lfm.bind(relaxation, np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]])), 70
     draws = {"noise": np.linspace(0.5, 0.8, count)}
     recorder = Recorder()
-    compute = {"scores": lambda **more: scores(bound, draws, **more),
+    compute = {"scores": lambda **more: scores(jax.random.key(0), bound, draws, **more),
                "trajectories": lambda **more: trajectories(jax.random.key(0), bound, draws, None, **more)}
     several = {name: run(store=recorder) for name, run in compute.items()}
     assert recorder.starts == [0, 20, 40, 60] * 2  # full batches of fours

@@ -29,6 +29,7 @@ from lfm_ppl.experiments.study import Data
 from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.inference.map import map_estimate
 from lfm_ppl.parallel.task import Result, Task
+from lfm_ppl.utils.random_keys import split_by_name
 
 REFERENCE = "reference"
 
@@ -104,26 +105,26 @@ def _apply_sites(task: Task, problem: CountsProblem, parameters: dict[str, float
     seconds, _ = time_call(lambda: [evidence(parameters, problem.y) for _ in range(REPEATS)])
     mean, sd = moments(problem.y)
     return {"log evidence": log_z, "mean": mean, "sd": sd, "seconds": seconds / REPEATS,
-            **score_held_out(task, problem, predict)}
+            **score_held_out(task.key, task, problem, predict)}
 
 
 def _apply_reference(task: Task, problem: CountsProblem, parameters: dict[str, float]) -> Result:
     draws = task.settings["draws"]
     reference = MonteCarloReference(problem.build_model(**parameters), problem.times, problem.sites)
-    key, fold_key = jax.random.split(task.key)
+    keys = split_by_name(task.key, ("sampler", "weights", "folds"))
 
     def sample(key: jax.Array, y: np.ndarray, draws: int) -> np.ndarray:
         return np.asarray(reference.sample(key, y, reference.proposal(y), draws))
 
-    seconds, f = time_call(sample, key, problem.y, draws)
+    seconds, f = time_call(sample, keys["sampler"], problem.y, draws)
     rows = np.unique(np.linspace(0, len(problem.y) - 1, 40).astype(int))
     diagnostics = scores.diagnose([str(row) for row in rows], np.moveaxis(f[..., rows], -1, 0))
-    log_weight = np.asarray(reference.log_weights(jax.random.fold_in(key, 1), problem.y,
+    log_weight = np.asarray(reference.log_weights(keys["weights"], problem.y,
                                                   reference.proposal(problem.y), CHAINS * draws))
     weight = np.exp(log_weight - log_weight.max())
 
     def predict(y: np.ndarray, is_held_out: np.ndarray, key: jax.Array) -> tuple[np.ndarray, ...]:
-        f = sample(jax.random.fold_in(fold_key, int(is_held_out.argmax())), y, max(draws // 5, 100))
+        f = sample(key, y, max(draws // 5, 100))
         f = f[..., is_held_out].reshape(-1, is_held_out.sum()).T
         columns = np.linspace(0, f.shape[1] - 1, PREDICTIVE_DRAWS).astype(int)
         return f, np.full(f.shape[1], 1.0 / f.shape[1]), f[:, columns]
@@ -132,27 +133,29 @@ def _apply_reference(task: Task, problem: CountsProblem, parameters: dict[str, f
             "log evidence error": weight.std() / weight.mean() / np.sqrt(weight.size),
             "share": weight.sum() ** 2 / (weight**2).sum() / weight.size, "mean": f.mean(axis=(0, 1)),
             "sd": f.std(axis=(0, 1)), "seconds": seconds, "ess": diagnostics["ess"].min(),
-            "r_hat": diagnostics["r_hat"].max(), **score_held_out(task, problem, predict)}
+            "r_hat": diagnostics["r_hat"].max(),
+            **score_held_out(keys["folds"], task, problem, predict)}
 
 
-def score_held_out(task: Task, problem: CountsProblem, predict: Callable) -> Result:
+def score_held_out(key: jax.Array, task: Task, problem: CountsProblem, predict: Callable) -> Result:
     """Return the ``log density`` (T,) of each row given the other folds, and its 95% interval, ``low`` and ``high``.
 
     Args:
-        task: the task; its random key determines the draws.
+        key: random key of the draws.
+        task: the task.
         problem: the problem.
         predict: map from data (T, 1), a mask (T,) of K held-out rows and a random key to predictors (K, S), their
             weights (S,), and draws of the predictors (K, D).
     """
     family: Any = problem.build_model(**task.settings["parameters"]).observation
     density, low, high = (np.full(len(problem.y), np.nan) for _ in range(3))
-    for fold in range(int(problem.folds.max()) + 1):
+    for fold, fold_key in enumerate(jax.random.split(key, int(problem.folds.max()) + 1)):
         is_held_out = problem.folds == fold
-        key, sample_key = jax.random.split(jax.random.fold_in(task.key, fold))
-        f, weights, draws = predict(np.where(is_held_out[:, None], np.nan, problem.y), is_held_out, key)
+        keys = split_by_name(fold_key, ("predictors", "data"))
+        f, weights, draws = predict(np.where(is_held_out[:, None], np.nan, problem.y), is_held_out, keys["predictors"])
         log_density = family.log_prob(jnp.asarray(f), jnp.asarray(problem.y[is_held_out]))
         density[is_held_out] = np.log(np.exp(np.asarray(log_density)) @ weights)
-        y = np.asarray(family.sample(sample_key, jnp.asarray(draws)))
+        y = np.asarray(family.sample(keys["data"], jnp.asarray(draws)))
         low[is_held_out], high[is_held_out] = np.quantile(y, (0.025, 0.975), axis=1)
     return {"log density": density, "low": low, "high": high}
 

@@ -43,6 +43,7 @@ from lfm_ppl.filtering.ep.moment_matching import (
     NEARLY_CONSTANT,
     MomentMatchingUpdate,
     observation_family,
+    sites_of_moments,
     stop_gradient_of_call,
     tilted_mode,
 )
@@ -175,9 +176,8 @@ def _sites_from_prior(problem: FilterProblem, terms: FamilyTerms, initial: Momen
     tilted = terms.tilted(cavity, tilted_mode(terms.log_prob, cavity), 1.0, is_coarse=True)
     usable = (terms.present & jnp.isfinite(tilted.log_partition) & (tilted.variance > 0)
               & ~is_deterministic(mean, variance))
-    variance = jnp.where(usable, tilted.variance, 1.0)
-    tau = jnp.where(usable, 1.0 / variance - 1.0 / cavity.variance, 0.0)
-    return Sites(mean, jnp.where(usable, tilted.shift / variance, 0.0), tau)
+    return sites_of_moments(cavity, jnp.where(usable, tilted.shift, 0.0),
+                            jnp.where(usable, tilted.variance, cavity.variance))
 
 
 def _smooth_with_sites(problem: FilterProblem, updater: Updater, initial: Moments, points: LinearizationPoints | None,

@@ -41,11 +41,17 @@ from lfm_ppl.model.observation_noise import row_log_prob
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.utils.linalg import diagonal
 
-_NEWTON_STEPS, _UNROLLED_STEPS, _NEWTON_TOLERANCE = 12, 3, 0.1
-"""Largest and least number of steps of the search for a mode, and its last step in standard deviations."""
+_NEWTON_STEPS, _PLAIN_STEPS, _UNROLLED_STEPS, _NEWTON_TOLERANCE = 60, 12, 3, 0.1
+"""Largest number of steps of the search for a mode, number before they grow, least number, and last step in sds."""
+
+_START_DISTANCES = np.concatenate([-(2.0 ** np.arange(6)), 2.0 ** np.arange(6)])
+"""Starts of the search in standard deviations from the mean, where the density at the mean is zero."""
 
 NEARLY_CONSTANT = 1e-13
 """Relative changes of a cavity's mean, squared, and of its variance, below which its factor is nearly constant."""
+
+_FAR = 1e3
+"""Distance in standard deviations from which a site's centre is moved."""
 
 _LEAST_PROBABILITY = 1e-15
 """Least probability of a residual, which then is -7.9."""
@@ -105,17 +111,27 @@ def row_sites(family: ObservationFamily, mean: jax.Array, covariance: jax.Array,
         usable = ~deterministic & jnp.isfinite(y[index]) & jnp.isfinite(log_partition) & (tilted.variance > 0)
         variance = jnp.where(usable, tilted.variance, cavity.variance)
         shift = jnp.where(usable, tilted.shift, 0.0)
-        tau = 1.0 / variance - 1.0 / cavity.variance
         gain = covariance[:, index] / cavity.variance
         moments = m + gain * shift, covariance + jnp.outer(gain, gain) * (variance - cavity.variance)
-        nu = shift / variance + tau * (middle - mean[index])
-        return moments, (nu, tau, jnp.where(jnp.isfinite(y[index]), log_partition, 0.0))
+        sites = sites_of_moments(MeanVariance(middle, cavity.variance), shift, variance)
+        return moments, (sites, jnp.where(jnp.isfinite(y[index]), log_partition, 0.0))
 
     if mean.shape[0] == 1:
-        nu, tau, log_partition = jax.tree.map(lambda a: a[None], entry((mean, covariance), 0)[1])
+        sites, log_partition = jax.tree.map(lambda a: a[None], entry((mean, covariance), 0)[1])
     else:
-        nu, tau, log_partition = jax.lax.scan(entry, (mean, covariance), jnp.arange(mean.shape[0]))[1]
-    return Sites(mean, nu, tau), log_partition.sum()
+        sites, log_partition = jax.lax.scan(entry, (mean, covariance), jnp.arange(mean.shape[0]))[1]
+    return sites, log_partition.sum()
+
+
+def sites_of_moments(cavity: MeanVariance, shift: jax.Array, variance: jax.Array) -> Sites:
+    """Return the sites by which a cavity gets other moments: the mean changes by ``shift``, arrays of one shape.
+
+    The centre is the cavity's mean, or the new mean where that is many sds away: nu would be a large number there, and
+    log evidences differences of its squares.
+    """
+    is_far = shift**2 > _FAR**2 * variance
+    return Sites(jnp.where(is_far, cavity.mean + shift, cavity.mean),
+                 shift / jnp.where(is_far, cavity.variance, variance), 1.0 / variance - 1.0 / cavity.variance)
 
 
 def tilted_prediction(log_prob: Callable, mean: jax.Array, variance: jax.Array) -> tuple[MeanVariance, TiltedMoments]:
@@ -134,7 +150,11 @@ def tilted_prediction(log_prob: Callable, mean: jax.Array, variance: jax.Array) 
 
 
 def tilted_mode(log_prob: Callable, cavity: MeanVariance) -> MeanVariance:
-    """Return the mode of N(f; cavity) p(f), entry by entry, and the variance from the curvature there."""
+    """Return the mode of N(f; cavity) p(f), entry by entry, and the variance from the curvature there.
+
+    Newton's steps are longest where the curvature is constant. Where it grows exponentially, as under a log link, they
+    have length one far from the mode: after `_PLAIN_STEPS` each successful step doubles the next.
+    """
     slope_at = jax.grad(lambda f: log_prob(f).sum())
 
     def objective(f: jax.Array) -> jax.Array:
@@ -146,22 +166,34 @@ def tilted_mode(log_prob: Callable, cavity: MeanVariance) -> MeanVariance:
         return slope, 1.0 / cavity.variance - curvature
 
     def step(carry: tuple) -> tuple:
-        f, value, radius, _, count = carry
+        f, value, radius, stretch, _, count = carry
         slope, precision = slope_and_precision(f)
         newton = (slope - (f - cavity.mean) / cavity.variance) / precision
         newton = jnp.where(jnp.isfinite(newton), newton, 0.0)
-        trial = f + jnp.clip(newton, -radius, radius)
+        move = jnp.clip(stretch * newton, -radius, radius)
+        trial = f + move
         new = objective(trial)
         is_better = new > value
-        return (jnp.where(is_better, trial, f), jnp.where(is_better, new, value),
-                jnp.where(is_better, 3.0 * radius, 0.25 * radius),
+        radius = jnp.where(is_better, 3.0, 0.25) * jnp.where(stretch > 1.0, jnp.abs(move), radius)
+        stretch = jnp.where(is_better & (count >= _PLAIN_STEPS), 2.0 * stretch, 1.0)
+        return (jnp.where(is_better, trial, f), jnp.where(is_better, new, value), radius, stretch,
                 (newton**2 * precision > _NEWTON_TOLERANCE**2).any(), count + 1)
 
-    start = (cavity.mean, objective(cavity.mean), 4.0 * jnp.sqrt(cavity.variance), jnp.array(True),
-             jnp.zeros((), int))
+    sd, value = jnp.sqrt(cavity.variance), objective(cavity.mean)
+
+    def best_start() -> tuple[jax.Array, jax.Array]:
+        trials = cavity.mean + sd * _START_DISTANCES.reshape(-1, *(1,) * jnp.ndim(sd))
+        values = jax.vmap(objective)(trials)
+        best = jnp.argmax(jnp.where(jnp.isnan(values), -jnp.inf, values), axis=0)[None]
+        is_zero = ~jnp.isfinite(value)
+        return (jnp.where(is_zero, jnp.take_along_axis(trials, best, axis=0)[0], cavity.mean),
+                jnp.where(is_zero, jnp.take_along_axis(values, best, axis=0)[0], value))
+
+    f, value = jax.lax.cond(jnp.isfinite(value).all(), lambda: (cavity.mean, value), best_start)
+    start = (f, value, 4.0 * sd, jnp.ones_like(sd), jnp.array(True), jnp.zeros((), int))
     # A loop of a few steps costs more than the steps.
     carry = functools.reduce(lambda carry, _: step(carry), range(_UNROLLED_STEPS), start)
-    f = jax.lax.while_loop(lambda carry: carry[3] & (carry[4] < _NEWTON_STEPS), step, carry)[0]
+    f = jax.lax.while_loop(lambda carry: carry[4] & (carry[5] < _NEWTON_STEPS), step, carry)[0]
     return MeanVariance(f, 1.0 / slope_and_precision(f)[1])
 
 

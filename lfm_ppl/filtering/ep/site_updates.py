@@ -97,7 +97,7 @@ def gaussian_terms(sites: Sites, cavity: MeanVariance, power: float) -> jax.Arra
     nu, tau, v = power * sites.nu, power * sites.tau, cavity.variance
     offset, growth = cavity.mean - sites.centre, 1.0 + tau * v
     growth = jnp.where(growth > 0, growth, 1.0)
-    return ((nu - 0.5 * tau * offset) * offset - 0.5 * jnp.log(growth) + 0.5 * (nu - tau * offset) ** 2 * v / growth)
+    return ((nu - 0.5 * tau * offset) * offset + 0.5 * nu**2 * v) / growth - 0.5 * jnp.log(growth)
 
 
 def log_evidence_terms(terms: Any, sites: Sites, marginals: SiteMarginals, settings: SiteSettings,

@@ -20,6 +20,7 @@ from numpyro import handlers
 from numpyro.infer import init_to_uniform
 
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.random_keys import split_by_name
 
 _GAUSSIAN = (dist.Normal, dist.MultivariateNormal, dist.LowRankMultivariateNormal)
 
@@ -37,14 +38,15 @@ class GaussianSite(eqx.Module):
 
     def deviation(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
         """Return a draw of the site's shape minus its mean."""
-        noise = jax.random.normal(key, shape)
+        keys = split_by_name(key, ("noise", "common factors"))
+        noise = jax.random.normal(keys["noise"], shape)
         if isinstance(self.fn, dist.Normal):
             draw = self.fn.scale * noise
         elif isinstance(self.fn, dist.MultivariateNormal):
             draw = jnp.einsum("...ij,...j->...i", self.fn.scale_tril, noise)
         else:
             factor = self.fn.cov_factor
-            common = jax.random.normal(jax.random.fold_in(key, 1), (*shape[:-1], factor.shape[-1]))
+            common = jax.random.normal(keys["common factors"], (*shape[:-1], factor.shape[-1]))
             draw = jnp.einsum("...ij,...j->...i", factor, common) + jnp.sqrt(self.fn.cov_diag) * noise
         return draw / jnp.sqrt(self.power)
 

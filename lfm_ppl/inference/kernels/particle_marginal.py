@@ -43,6 +43,7 @@ from lfm_ppl.inference.kernels.robust_metropolis import (
 from lfm_ppl.inference.particle_likelihood import ParticlePotential, Tuned
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.random_keys import split_by_name
 
 _TARGET, _TARGET_ONE = 0.12, 0.21
 """Target acceptance in several dimensions and in one: half of RAM's, since noise of sd one in the log likelihood halves
@@ -212,14 +213,14 @@ class ParticleMarginalRAM(RAM):
         if self.tuned is not None and observations == self._tuned_observations:
             return
         self._tuned_observations = observations
-        key = jax.random.key(0)
+        keys = split_by_name(jax.random.key(0), ("start", "estimates"))
         z = start if self._tune_at is None else ravel_pytree(self._tune_at)[0]
         if checks.traced(z):
-            z = bound.draw(key, self._init_strategy)
+            z = bound.draw(keys["start"], self._init_strategy)
         if self._particles is None:
-            self.tuned = self.estimate.tune(z, key)
+            self.tuned = self.estimate.tune(z, keys["estimates"])
         else:
-            self.tuned = Tuned(self._particles, self.estimate.sd_of_estimates(z, key, self._particles))
+            self.tuned = Tuned(self._particles, self.estimate.sd_of_estimates(z, keys["estimates"], self._particles))
 
     def estimate_at(self, y: Any) -> Callable[[Any, jax.Array], jax.Array]:
         """Return the function from a position and a key to the estimated potential energy, given observations."""
@@ -246,7 +247,8 @@ def particle_marginal(estimate_at: Callable[[Any], Callable[[Any, jax.Array], ja
     """
 
     def init(key: jax.Array, point: ParamInfo, data: Any, factor: jax.Array) -> ParticleMarginalState:
-        energy = finite_or_infinity(jax.jit(estimate_at(data))(point.z, jax.random.fold_in(key, 1)))
+        key, estimate_key = jax.random.split(key)
+        energy = finite_or_infinity(jax.jit(estimate_at(data))(point.z, estimate_key))
         surrogate_energy = jnp.zeros_like(energy) if surrogate_at is None else point.potential_energy
         ram = initial_state(point.z, energy, key, factor, num_warmup)
         return ParticleMarginalState(ram, surrogate_energy, jnp.array(False), key)

@@ -154,9 +154,8 @@ class RAM(Kernel):
     def _starting_position(self, key: jax.Array, init_params: Any, args: tuple,
                            kwargs: dict) -> tuple[Any, jax.Array]:
         if self._model is not None:
-            first_key = key if is_prng_key(key) else key[0]
             # init_to_uniform also serves improper priors, from which nothing can be drawn.
-            seeded = handlers.substitute(handlers.seed(self._model, first_key), substitute_fn=init_to_uniform)
+            seeded = handlers.substitute(handlers.seed(self._model, jax.random.key(0)), substitute_fn=init_to_uniform)
             check_latent(latent_sites(handlers.trace(seeded).get_trace(*args, **kwargs)), "RAM")
             info, self._potential_fn_gen, self._postprocess_fn, _ = initialize_model(
                 key,

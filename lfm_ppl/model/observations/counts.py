@@ -9,10 +9,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import betainc, gammaincc, gammaln
+from jax.scipy.special import betainc, gammaincc
 
 from lfm_ppl.model.observations.family import ObservationFamily, as_parameter, is_not_count
 from lfm_ppl.model.observations.links import RATES, link_name
+from lfm_ppl.model.observations.saddle_point import LOG_2PI, stirling_error
 
 _POISSON_LIMIT = 1e8
 """Concentration above which the negative binomial distribution is Poisson to eight digits."""
@@ -79,8 +80,10 @@ class PoissonObservation(_CountObservation):
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return y log(E g) - E g - log y!, (D,)."""
-        log_mean = self._log_mean(predictor)
-        return self._where_positive(log_mean, y * log_mean - self.mean(predictor) - gammaln(y + 1.0))
+        log_mean, reference = self._log_mean(predictor), jnp.where(y > 0, y, 1.0)
+        log_ratio = log_mean - jnp.log(reference)
+        at_reference = jnp.where(y > 0, -stirling_error(reference) - 0.5 * (LOG_2PI + jnp.log(reference)), -1.0)
+        return self._where_positive(log_mean, at_reference + y * log_ratio - reference * jnp.expm1(log_ratio))
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw counts (D,)."""
@@ -121,16 +124,16 @@ class NegativeBinomialObservation(_CountObservation):
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return the log probabilities (D,) of counts."""
-        c, log_mean = self.concentration, self._log_mean(predictor)
-        log_odds = log_mean - jnp.log(c)
-        log_total = jax.nn.softplus(log_odds)  # log(1 + mu / c)
-        # log Gamma(y + c) / (Gamma(c) c^y) is a difference of large numbers where c is large: use Stirling's series.
-        is_large = c > 1e3
-        small_c, large_c = jnp.where(is_large, 1.0, c), jnp.where(is_large, c, 1e3)
-        log_rising_factorial = jnp.where(
-            is_large, (y + large_c - 0.5) * jnp.log1p(y / large_c) - y - y / (12.0 * large_c * (y + large_c)),
-            gammaln(y + small_c) - gammaln(small_c) - y * jnp.log(small_c))
-        value = log_rising_factorial - gammaln(y + 1.0) - c * log_total + y * (log_mean - log_total)
+        c, log_mean, reference = self.concentration, self._log_mean(predictor), jnp.where(y > 0, y, 1.0)
+        log_ratio = log_mean - jnp.log(reference)
+        at_count = (stirling_error(reference + c) - stirling_error(c) - stirling_error(reference)
+                    - 0.5 * (LOG_2PI + jnp.log(reference) + jnp.log1p(reference / c)))
+        at_reference = jnp.where(y > 0, at_count, -c * jnp.log1p(1.0 / c))
+        # y log(mu / r) - (y + c) log((c + mu) / (c + r)), in the form whose terms are smaller.
+        is_large_c = c > reference
+        sign, factor = jnp.where(is_large_c, 1.0, -1.0), jnp.where(is_large_c, y, c)
+        share = jnp.minimum(reference, c) / (reference + c)
+        value = at_reference + sign * factor * log_ratio - (y + c) * _log_mixture(share, sign * log_ratio)
         return self._where_positive(log_mean, value)
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
@@ -149,6 +152,13 @@ class NegativeBinomialObservation(_CountObservation):
         poisson_below, poisson_up_to = _poisson_cumulative(mean, y)
         return (jnp.where(is_overdispersed, below, poisson_below),
                 jnp.where(is_overdispersed, betainc(c, y + 1.0, probability), poisson_up_to))
+
+
+def _log_mixture(share: jax.Array, log_ratio: jax.Array) -> jax.Array:
+    """Return log(1 - share + share exp(log_ratio)) without cancellation or overflow."""
+    # Beyond the square root of the largest number, the exponential is all of the mixture.
+    clipped = jnp.minimum(log_ratio, 0.5 * np.log(jnp.finfo(log_ratio.dtype).max))
+    return jnp.log1p(share * jnp.expm1(clipped)) + (log_ratio - clipped)
 
 
 def _poisson_cumulative(rate: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -9,10 +9,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import betainc, gammaln
+from jax.scipy.special import betainc
 
 from lfm_ppl.model.observations.family import ObservationFamily, as_parameter, is_not_count
 from lfm_ppl.model.observations.links import PROBABILITIES, link_name
+from lfm_ppl.model.observations.saddle_point import LOG_2PI, stirling_error
 
 
 class _TrialObservation(ObservationFamily):
@@ -100,9 +101,16 @@ class BinomialObservation(_TrialObservation):
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return log C(n, y) + y log p + (n - y) log(1 - p), (D,)."""
         (log_probability, log_complement), n = PROBABILITIES[self.link], self.total_count
-        log_coefficient = gammaln(n + 1.0) - gammaln(y + 1.0) - gammaln(n - y + 1.0)
-        return (log_coefficient + _log_power(log_probability(predictor), y)
-                + _log_power(log_complement(predictor), n - y))
+        others, is_mixed = n - y, (y > 0) & (y < n)
+        trials, successes, failures = (jnp.where(is_mixed, number, default) for number, default in (
+            (n, 2.0), (y, 1.0), (others, 1.0)))
+        coefficient = (stirling_error(trials) - stirling_error(successes) - stirling_error(failures)
+                       - 0.5 * (LOG_2PI + jnp.log(successes) + jnp.log(failures / trials)))
+        # Shares of y / n and 1 - y / n are the reference, where the two deviances are zero.
+        terms = [_log_power(log_p - jnp.log(jnp.where(is_mixed, share, 1.0)), number, is_mixed)
+                 for log_p, share, number in ((log_probability(predictor), successes / trials, y),
+                                              (log_complement(predictor), failures / trials, others))]
+        return jnp.where(is_mixed, coefficient, 0.0) + terms[0] + terms[1]
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw counts (D,)."""
@@ -125,6 +133,10 @@ class BinomialObservation(_TrialObservation):
         return is_not_count(y) | (y > np.asarray(self.total_count)), "counts: whole numbers from zero to total_count"
 
 
-def _log_power(log_probability: jax.Array, count: jax.Array) -> jax.Array:
-    """Return count * log p, zero for a count of zero also where log p is infinite."""
-    return jnp.where(count == 0, 0.0, count * log_probability)
+def _log_power(log_ratio: jax.Array, count: jax.Array, is_mixed: jax.Array) -> jax.Array:
+    """Return count * log_ratio, zero for a count of zero also where the ratio is infinite.
+
+    Among successes and failures the sum of count * (ratio - 1) over both is zero; it cancels their rounding errors.
+    """
+    correction = jnp.where(is_mixed, jnp.expm1(log_ratio), 0.0)
+    return jnp.where(count == 0, 0.0, count * (log_ratio - correction))

@@ -1,8 +1,12 @@
-"""Random keys outside of compiled code."""
+"""Random keys: one key for each purpose, and keys outside of compiled code.
+
+A key is split once, where it is consumed, and not used again. `jax.random.fold_in` with a small integer gives no other
+keys: with JAX's partitionable keys ``fold_in(key, i)`` equals ``split(key, n)[i]``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -10,6 +14,18 @@ import numpy as np
 
 _FEWEST = 64
 """Smallest number of split keys, so that one program serves chains, attempts and short runs."""
+
+
+def split_by_name(key: jax.Array, names: Iterable[str]) -> dict[str, jax.Array]:
+    """Split a key into one key for each name, in compiled code too.
+
+    Example:
+        >>> keys = split_by_name(jax.random.key(0), ("path", "noise"))
+        >>> list(keys)
+        ['path', 'noise']
+    """
+    names = tuple(names)
+    return dict(zip(names, jax.random.split(key, len(names)), strict=True))
 
 
 def split_keys(key: jax.Array, count: int) -> Callable[[Any], jax.Array]:

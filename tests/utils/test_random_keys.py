@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from lfm_ppl.inference.random_keys import split_keys
+from lfm_ppl.utils.random_keys import split_keys
 from tests.compiled_programs import compilations
 
 
