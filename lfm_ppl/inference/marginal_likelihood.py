@@ -158,7 +158,13 @@ class MarginalLikelihood(SeriesLikelihood):
         if self.is_family:
             return f"approximate (sites by {self.sites_in_words})"
         if self.is_affine:
-            return "exact (the model is linear)"
+            if self.ssm.is_integrated_exactly:
+                return "exact (the model is linear)"
+            if self.ssm.has_constant_coefficients:
+                ignored = "" if self.tolerance is None else "; tolerance has no effect"
+                return f"exact transitions, known inputs integrated in {self.steps} steps between two times{ignored}"
+            return "linear model, integrated " + (f"in {self.steps} steps between two times" if self.tolerance is None
+                                                  else f"with tolerance {self.tolerance:g}")
         if not self.iterations:
             return "approximate (a single pass of the filter)"
         count = {1: "one iteration", 2: "two iterations", 3: "three iterations"}.get(
