@@ -65,8 +65,8 @@ def _apply(equation: Any, operands: list[float]) -> list[float]:
         return [sum(operands)] * count
     if name == "div" and operands[1] == 0.0:
         return [operands[0]] * count
-    if name == "integer_pow" and equation.params["y"] > 0:
-        return [equation.params["y"] * operands[0]] * count
+    if name == "square" or (name == "integer_pow" and equation.params["y"] > 0):
+        return [equation.params.get("y", 2) * operands[0]] * count
     if name in ("gather", "dynamic_slice", "select_n"):
         indices = operands[:1] if name == "select_n" else operands[1:]
         return [np.inf if any(indices) else highest] * count
