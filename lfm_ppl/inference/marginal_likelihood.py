@@ -67,7 +67,8 @@ class MarginalLikelihood(SeriesLikelihood):
         damping: largest share of each new iterate that is taken; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations. With it the length of the steps follows
             the moments, for every parameter anew, for posteriors over slow and fast models; up to five times ``steps``
-            are tried. None: ``steps`` equal steps. Not with ``iterations``.
+            are tried. None: ``steps`` equal steps. Not with ``iterations``. A linear model has exact transitions, with
+            equal steps over its known inputs.
         sites: of an observation family, how its sites are refined: "ep" (expectation propagation, the default),
             "variational", "laplace", or `lfm_ppl.SiteSettings`. The log density is then the log evidence of the
             converged sites. Where the model is not linear it is linearised about smoothed moments, ``iterations`` times
