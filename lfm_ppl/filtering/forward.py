@@ -35,7 +35,7 @@ from lfm_ppl.filtering.predict import (
     predict_exact,
     predict_interval,
 )
-from lfm_ppl.filtering.problem import FilterProblem, has_exact_transitions
+from lfm_ppl.filtering.problem import FilterProblem
 from lfm_ppl.filtering.update import (
     INNOVATION_FACTOR,
     UPDATE_FAILED,
@@ -200,7 +200,7 @@ def predict(problem: FilterProblem, interval: Intervals, moments: Moments, about
     """
     ssm, _, grid, shared = problem
     dynamics, transition = problem.dynamics, shared.transition(interval)
-    is_exact = has_exact_transitions(ssm, grid)
+    is_exact = ssm.has_constant_coefficients
     has_nodes = record is Record.LINEARIZATION and grid.tolerance is None and not is_exact
     if record is Record.LINEARIZATION and not has_nodes:
         record = Record.SMOOTHER
@@ -219,7 +219,7 @@ def predict(problem: FilterProblem, interval: Intervals, moments: Moments, about
         return _collect_nodes(problem, interval, prediction) if has_nodes else prediction
 
     if is_exact:
-        prediction = predict_exact(ssm, transition, grid.steps, interval.span, interval.length, moments)
+        prediction = predict_exact(ssm, shared.linear, transition, grid.steps, interval.span, interval.length, moments)
     elif grid.replicated:
         prediction = jax.lax.cond(interval.length > 0, integrate, keep_moments)
     else:
@@ -252,11 +252,11 @@ def _collect_nodes(problem: FilterProblem, interval: Intervals, prediction: Pred
 def maps_about(problem: FilterProblem, points: LinearizationPoints | None) -> IntervalMaps | None:
     """Return the affine maps of all intervals of a model that is linearised about given points.
 
-    They are None for a model with exact transitions or adaptive steps, whose passes compute them at no cost or need
-    the moments for them. A linear model is linearised about no points.
+    They are None for a time-invariant model or adaptive steps, whose passes compute them at no cost or need the moments
+    for them. A linear model is linearised about no points.
     """
     ssm, rule, grid, _ = problem
-    if has_exact_transitions(ssm, grid) or grid.tolerance is not None:
+    if ssm.time_invariant or grid.tolerance is not None:
         return None
 
     def interval_map(inputs: tuple[Intervals, Moments | None]) -> IntervalMaps:

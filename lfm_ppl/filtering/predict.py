@@ -1,6 +1,7 @@
 """Prediction: the moments, and the affine map if it is recorded, over one interval of the scan.
 
-1. A linear time-invariant model has an exact transition, tabulated by interval length.
+1. A linear model with constant coefficients has an exact transition, tabulated by interval length. Known inputs and a
+   dispersion that varies with time are taken as quadratic in time over each step, and integrated exactly.
 2. Any other model takes equal steps: Simpson's rule if only the forces enter non-linearly (`simpson`), else the
    covariance-preserving Runge-Kutta method (`runge_kutta`); exponential steps (`exponential`) where these are chosen;
    or steps that follow a tolerance (`adaptive`).
@@ -27,11 +28,18 @@ from lfm_ppl.filtering.intervals import EXPONENTIAL
 from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose, matvec, transform
 from lfm_ppl.filtering.runge_kutta import runge_kutta_step
 from lfm_ppl.filtering.simpson import apply_step_map, insert_midpoints, step_maps
-from lfm_ppl.filtering.transition import Exact, IntegratingFactor, LinearPart, integrating_factor
+from lfm_ppl.filtering.transition import (
+    Exact,
+    InputWeights,
+    IntegratingFactor,
+    LinearPart,
+    dispersion_noise,
+    integrating_factor,
+)
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.events import StateMap
 from lfm_ppl.model.state_space import Span, StateSpaceModel
-from lfm_ppl.utils.linalg import matmul
+from lfm_ppl.utils.linalg import congruence, matmul
 
 _LARGEST_TABULATED = 8
 """Largest number of force states whose transitions to all nodes of an interval are tabulated; others are chained."""
@@ -51,37 +59,65 @@ class StepRecord(NamedTuple):
     phi: jax.Array
 
 
-def predict_exact(ssm: StateSpaceModel, transition: Exact, steps: int, span: Span, length: jax.Array,
-                  moments: Moments) -> Prediction:
-    """Predict by the exact transition of a linear time-invariant model."""
-    mean, covariance = transform(moments, transition.phi, transition.process_cov)
+def predict_exact(ssm: StateSpaceModel, linear: LinearPart, transition: Exact, steps: int, span: Span,
+                  length: jax.Array, moments: Moments) -> Prediction:
+    """Predict by the exact transition of a linear model with constant coefficients."""
+    process_cov = transition.process_cov
+    if transition.inputs is not None and callable(ssm.model.process_noise):
+        noise = _integrated_noise(ssm, linear, transition.inputs.transition, steps, span, length / steps)
+        process_cov = process_cov.at[:ssm.physical_dim, :ssm.physical_dim].add(noise)
+    mean, covariance = transform(moments, transition.phi, process_cov)
     offset = exact_offset(ssm, transition, steps, span, length)
-    return Prediction(Moments(mean + offset, covariance), transition.phi, transition.process_cov)
+    return Prediction(Moments(mean + offset, covariance), transition.phi, process_cov)
 
 
 def exact_offset(ssm: StateSpaceModel, transition: Exact, steps: int, span: Span, length: jax.Array) -> jax.Array:
     """Return the offset (n,) that an exact transition adds to phi s over an interval with the times ``span``."""
-    if ssm.mean_invariant or not ssm.physical_dim:
+    if transition.inputs is None:
         return transition.offset
-    return _integrated_offset(ssm, transition, steps, span, length / steps)
+    return transition.offset.at[:ssm.physical_dim].set(
+        _integrated_offset(ssm, transition.inputs, steps, span, length / steps))
 
 
-def _integrated_offset(ssm: StateSpaceModel, transition: Exact, steps: int, span: Span, h: jax.Array) -> jax.Array:
-    """Integrate E(H - s) c(s) by Simpson's rule, where c are the additive terms of the mean."""
-    size = ssm.physical_dim
+def _integrated_offset(ssm: StateSpaceModel, weights: InputWeights, steps: int, span: Span, h: jax.Array) -> jax.Array:
+    """Integrate the additive terms of the mean of the physical state (M,), quadratic in time over each step."""
 
     def additive_terms(t: jax.Array) -> jax.Array:
-        return jnp.zeros((ssm.state_dim, 1)).at[:size, 0].set(ssm.drift(ssm.input_map(t)[1], t))
+        return ssm.drift(ssm.input_map(t)[1], t)[:, None]
 
     def step(offset: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
-        rest_of_span = span.shifted(index * h)
-        first = matmul(transition.full, offset + h / 6 * additive_terms(rest_of_span.time()))
-        last = additive_terms(rest_of_span.time(h))
-        middle = matmul(transition.half, additive_terms(rest_of_span.time(0.5 * h)))
-        return first + h / 6 * (4 * middle + last), None
+        first, middle, last = (additive_terms(t) for t in _step_times(span, h, index))
+        return matmul(weights.transition, offset) + weights.integrate(first, middle, last), None
 
-    offset, _ = jax.lax.scan(step, jnp.zeros((ssm.state_dim, 1)), jnp.arange(steps))
+    offset, _ = jax.lax.scan(step, jnp.zeros((ssm.physical_dim, 1)), jnp.arange(steps))
     return offset[:, 0]
+
+
+def _integrated_noise(ssm: StateSpaceModel, linear: LinearPart, transition: jax.Array, steps: int, span: Span,
+                      h: jax.Array) -> jax.Array:
+    """Integrate the process noise (M, M) of a dispersion that varies with time, quadratic over each step.
+
+    ``transition`` (M, M) is that of the physical state over a step.
+    """
+    jacobian = linear.rows[:, :ssm.physical_dim]
+
+    def dispersion(t: jax.Array) -> jax.Array:
+        value = ssm.dispersion(ssm.input_map(t)[1], t)
+        assert value is not None
+        return value
+
+    def step(noise: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
+        first, middle, last = (dispersion(t) for t in _step_times(span, h, index))
+        return congruence(transition, noise) + dispersion_noise(jacobian, h, first, middle, last), None
+
+    shape = (ssm.physical_dim, ssm.physical_dim)
+    return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), jnp.zeros(shape), jnp.arange(steps))[0]
+
+
+def _step_times(span: Span, h: jax.Array, index: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the times of start, middle and end of a step."""
+    rest_of_span = span.shifted(index * h)
+    return rest_of_span.time(), rest_of_span.time(0.5 * h), rest_of_span.time(h)
 
 
 def interval_factor(ssm: StateSpaceModel, rule: Rule, linear: LinearPart, length: jax.Array, steps: int,

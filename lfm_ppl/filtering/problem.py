@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.dynamics import Dynamics
-from lfm_ppl.filtering.intervals import EXPONENTIAL, Intervals, TimeGrid, by_length, with_state_maps, with_transitions
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid, by_length, with_state_maps, with_transitions
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.predict import interval_factor
 from lfm_ppl.filtering.transition import LinearPart, constant_jacobian, exact, linear_part
@@ -70,14 +70,6 @@ class FilterProblem(NamedTuple):
         return Moments(*self.ssm.initial()) if initial is None else initial
 
 
-def has_exact_transitions(ssm: StateSpaceModel, grid: TimeGrid) -> bool:
-    """Return whether the transitions of a model over intervals are exact, so that nothing but inputs is integrated.
-
-    Simpson's rule for known inputs is wrong for stiff dynamics, which then takes exponential steps.
-    """
-    return ssm.mean_invariant or (ssm.time_invariant and grid.method != EXPONENTIAL)
-
-
 def filter_problem(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> FilterProblem:
     """Compute what all intervals share."""
     linear = linear_part(ssm, jnp.asarray(grid.initial_time, float))
@@ -85,14 +77,14 @@ def filter_problem(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> FilterPr
     is_tabulated = grid.lengths is not None and len(grid.lengths) <= max(_FEW_LENGTHS, count // _INTERVALS_PER_LENGTH)
 
     def transition(length: jax.Array) -> Any:
-        if has_exact_transitions(ssm, grid):
+        if ssm.has_constant_coefficients:
             return exact(ssm, length, grid.steps, linear)
         if grid.tolerance is not None:
             return None
         return interval_factor(ssm, rule, linear, length, grid.steps, is_tabulated)
 
     grid = with_state_maps(ssm, grid)
-    if grid.lengths is None and has_exact_transitions(ssm, grid):
+    if grid.lengths is None and ssm.has_constant_coefficients:
         grid = with_transitions(grid, transition)
         transition_of: Callable[[Intervals], Any] = operator.attrgetter("transition")
     else:
@@ -116,8 +108,7 @@ def is_observation_nonlinear(ssm: StateSpaceModel) -> bool:
 
 def is_linear(ssm: StateSpaceModel) -> bool:
     """Return whether no pass depends on the moments about which the model is linearised."""
-    return (ssm.drift_structure.linear and ssm.observation_structure.linear
-            and not callable(ssm.model.process_noise))
+    return ssm.drift_structure.linear and ssm.observation_structure.linear
 
 
 def at_intervals(tree: Any, intervals: Any) -> Any:

@@ -2,11 +2,14 @@ r"""Prediction over an interval in which the dynamics is non-linear in the force
 
 1. The forces obey a linear SDE, so that their moments at all nodes of the interval follow from its start.
 2. Linearise the dynamics at all nodes at once; no stage changes the moments that another stage is linearised about.
-3. The Runge-Kutta method is then Simpson's rule. With the exponential E of the linear part and the Jacobians K,
+3. The Runge-Kutta method is then a quadrature. With the exponential E of the linear part, the Jacobians K_i and the
+   weights W_i of `lfm_ppl.filtering.transition.InputWeights`,
 
-       Phi = E(h) + h / 6 (E(h) K_1 + 4 E(h/2) K_2 E(h/2) + K_3 E(h)).
+       Phi = E(h) + W_1 K_1 + W_2 K_2 E(h/2) + W_3 K_3 E(h),
 
-4. Compose the maps of the steps in one scan. The result equals that of `runge_kutta_step`.
+   where h/6 E(h), 4 h/6 E(h/2) and h/6 would be Simpson's rule. The weights differ from these in the fifth order of h
+   where the step resolves the linear part, and are right where a state decays within the step.
+4. Compose the maps of the steps in one scan.
 """
 
 from __future__ import annotations
@@ -144,7 +147,7 @@ def _simpson_step(factor: IntegratingFactor, h: jax.Array, nodes: tuple[_Node, .
     transition to a stage's node, differ.
     """
     half, full = factor.half, factor.full
-    half_x, full_x = half[:size, :size], full[:size, :size]
+    full_x = full[:size, :size]
 
     # The remainder of the drift is one more column, which the forces' transition leaves alone.
     def with_remainder(transition: jax.Array) -> jax.Array:
@@ -153,7 +156,8 @@ def _simpson_step(factor: IntegratingFactor, h: jax.Array, nodes: tuple[_Node, .
     first, second, third = (node.remainder for node in nodes)
     middle = matmul(second, with_remainder(half[size:, size:]))
     last = matmul(third, with_remainder(full[size:, size:]))
-    increment = h / 6 * (matmul(full_x, first) + 4.0 * matmul(half_x, middle) + last)
+    assert factor.weights is not None
+    increment = factor.weights.integrate(first, middle, last)
     jacobian, offset = increment[:, :-1], increment[:, -1]
     pulled = matmul(factor.back_half[:size, :size], middle[:, :-1])
     inverse = h * jnp.stack([0.5 * first[:, :-1], 0.5 * pulled, pulled])
@@ -162,6 +166,8 @@ def _simpson_step(factor: IntegratingFactor, h: jax.Array, nodes: tuple[_Node, .
     nonlinear = jnp.concatenate([jacobian[None], matmul(jacobian - matmul(full_x, inverse), backward)])
     transports = jnp.concatenate([linear[:, :, :size], linear[:, :, size:] + nonlinear], axis=2)
     start, midpoint, end = (node.diffusion for node in nodes)
-    diffusions = stack_diffusions(start, midpoint, midpoint, end)
+    diffusions = stack_diffusions(start, midpoint, midpoint, end) if factor.state_noise is None else None
     process_cov = process_cov_at(factor, -1, transports, diffusions, h * WEIGHTS, size)
+    if factor.state_noise is not None:
+        process_cov = process_cov.at[:size, :size].add(factor.state_noise)
     return StepMap(jnp.concatenate([transports[0], full[size:]]), offset, process_cov)

@@ -94,7 +94,7 @@ def lay_out_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: fl
     concrete_times = check_times(times, initial_time)
     start = concrete_times[0] if initial_time is None and concrete_times is not None else initial_time
     origin = None if start is None else checks.concrete(start)
-    is_adaptive = tolerance is not None
+    is_adaptive = tolerance is not None and not ssm.has_constant_coefficients
     if concrete_times is None and _refuses_traced_times.get():
         raise ValueError("a time grid of traced times differs from that of their values.")
     if concrete_times is None or origin is None:

@@ -8,19 +8,23 @@ consists of the constant linear part of the dynamics and the forces.
 
 1. `linear_part` evaluates the constant Jacobian J, B of the drift.
 2. `exact` gives the transition of a model without any other part.
-3. `integrating_factor` gives the transitions over half and full steps, and the regressions of the noise of the steps on
+3. `input_weights` gives the weights with which a step adds up known inputs, exact for inputs quadratic in time;
+   `dispersion_noise` the process noise of a dispersion that is quadratic in time.
+4. `integrating_factor` gives the transitions over half and full steps, and the regressions of the noise of the steps on
    the noise of the forces, for a Runge-Kutta step over the rest.
+
+Source: Hochbruck and Ostermann (2010), Acta Numerica 19, section 2, for the weights.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.forces.discretise import discretise, discretise_steps
+from lfm_ppl.forces.discretise import discretise, discretise_dispersion, discretise_steps, phi_functions
 from lfm_ppl.linearisation.rule import Function, partial_jacobian, selection
 from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -39,17 +43,39 @@ class LinearPart(NamedTuple):
     rows: jax.Array
 
 
-class Exact(NamedTuple):
-    """Transition of a linear time-invariant model over an interval: s -> phi s + offset + N(0, process_cov).
+class InputWeights(NamedTuple):
+    r"""Weights of known inputs b(s), additive terms of dx/dt = J x + b(s), over a step of length h.
 
-    ``half`` and ``full`` are E(h/2) and E(h) of a step, for an offset that is integrated; None where it is exact.
+        int_0^h exp(J (h - s)) b(s) ds = first b(0) + middle b(h/2) + last b(h)
+
+    for b quadratic in time, however large J h is; where J h is small they are those of Simpson's rule.
+
+    Attributes:
+        transition: exp(J h) (M, M).
+        first, middle, last: (M, M).
+    """
+
+    transition: jax.Array
+    first: jax.Array
+    middle: jax.Array
+    last: jax.Array
+
+    def integrate(self, first: jax.Array, middle: jax.Array, last: jax.Array) -> jax.Array:
+        """Return the integral (M, K) of inputs whose values (M, K) at start, middle and end of the step are given."""
+        return matmul(self.first, first) + matmul(self.middle, middle) + matmul(self.last, last)
+
+
+class Exact(NamedTuple):
+    """Transition of a model with constant coefficients over an interval: s -> phi s + offset + N(0, process_cov).
+
+    An offset or a dispersion that varies with time is not included: a filter integrates it in steps with the weights
+    ``inputs``, which are None where nothing varies.
     """
 
     phi: jax.Array
     process_cov: jax.Array
     offset: jax.Array
-    half: Any = None
-    full: Any = None
+    inputs: InputWeights | None = None
 
 
 class IntegratingFactor(NamedTuple):
@@ -61,7 +87,9 @@ class IntegratingFactor(NamedTuple):
     ``force_cov_full`` are the exact covariances of the forces' noise, ``inputs`` (nz, S) its dispersion. ``columns``
     (nz, K) stand for the forces' noise at the nodes of each later stage (not by quadrature) and, the last, of the whole
     step; ``regressions`` (K, nz) regress them on the exact noise. ``halves`` are the transitions and the noise (2 J +
-    1, nz, nz) of the forces over 0, 1, ..., 2 J halves of a step; None where they are chained.
+    1, nz, nz) of the forces over 0, 1, ..., 2 J halves of a step; None where they are chained. Where the rest of the
+    dynamics is known at all nodes, ``weights`` integrate it, and ``state_noise`` (M, M) is the exact noise of a
+    constant dispersion; None otherwise.
     """
 
     half: jax.Array
@@ -74,6 +102,8 @@ class IntegratingFactor(NamedTuple):
     columns: tuple[jax.Array, ...]
     regressions: tuple[jax.Array, ...]
     halves: tuple[jax.Array, jax.Array] | None = None
+    weights: InputWeights | None = None
+    state_noise: jax.Array | None = None
 
 
 def constant_jacobian(function: Function, point: jax.Array, structure: InputStructure, outputs: int) -> jax.Array:
@@ -105,11 +135,42 @@ def feedback(ssm: StateSpaceModel, linear: LinearPart) -> jax.Array:
     return jnp.concatenate([linear.rows, below])
 
 
-def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPart | None = None) -> Exact:
-    """Return the transition of a linear time-invariant model over an interval of ``length``, or of many (B,).
+def input_weights(jacobian: jax.Array, step: jax.Array) -> InputWeights:
+    """Return the weights of known inputs over a step, for the Jacobian J (M, M) of the physical state in itself."""
+    exponential, phi1, phi2, phi3 = phi_functions(jacobian * step)
+    # The Lagrange polynomials of the nodes 0, 1/2, 1, and int_0^1 exp(X (1 - s)) s^k ds = k! phi_(k+1)(X).
+    return InputWeights(exponential, step * (phi1 - 3.0 * phi2 + 4.0 * phi3), step * (4.0 * phi2 - 8.0 * phi3),
+                        step * (4.0 * phi3 - phi2))
 
-    Its ``linear`` part is that of any time. The offset is exact where the mean is invariant; otherwise zero, and the
-    filter integrates it with E(h/2), E(h).
+
+def dispersion_noise(jacobian: jax.Array, step: jax.Array, first: jax.Array, middle: jax.Array,
+                     last: jax.Array) -> jax.Array:
+    r"""Return the process noise (M, M) of dx = J x dt + G(s) dB over a step of length h.
+
+        Q = int_0^h exp(J r) G(h - r) G(h - r)' exp(J r)' dr,
+
+    for the dispersion G quadratic in time, however large J h is. The columns Y_k = exp(J r) d^k G(h - r)/dr^k obey the
+    linear ODE Y_k' = J Y_k + Y_(k+1), so that one discretisation of three times the size gives Q as a sum of squares.
+
+    Args:
+        jacobian: J (M, M).
+        step: h.
+        first: G (M, S) at the start of the step.
+        middle: G at its middle.
+        last: G at its end.
+    """
+    size = jacobian.shape[0]
+    slope, curvature = 4.0 * middle - 3.0 * last - first, 4.0 * (first - 2.0 * middle + last)
+    chain = jnp.kron(jnp.eye(3), step * jacobian) + np.kron(np.diag(np.ones(2), 1), np.eye(size))
+    _, noise = discretise_dispersion(chain, jnp.concatenate([last, slope, curvature]), 1.0)
+    return step * noise[:size, :size]
+
+
+def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPart | None = None) -> Exact:
+    """Return the transition of a model with constant coefficients over an interval of ``length``, or of many (B,).
+
+    Its ``linear`` part is that of any time. The offset is zero, and the process noise that of the forces, where they
+    vary with time.
     """
     size, total = ssm.physical_dim, ssm.state_dim
     is_block = jnp.ndim(length) == 1
@@ -124,8 +185,9 @@ def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPar
     constant = jnp.zeros(total).at[:size].set(ssm.drift(shift, t)) if ssm.mean_invariant else jnp.zeros(total)
     lin = feedback(ssm, linear)
     dispersion = ssm.model.process_noise
+    is_constant = dispersion is not None and not callable(dispersion)
     diffusion = jax.scipy.linalg.block_diag(
-        jnp.zeros((size, size)) if dispersion is None else matmul(dispersion, dispersion.T),
+        matmul(dispersion, dispersion.T) if is_constant else jnp.zeros((size, size)),
         matmul(ssm.stack.dispersion(), ssm.stack.dispersion().T), jnp.zeros((1, 1)))
     # One more state that is constantly one carries the offset.
     augmented = jnp.zeros((total + 1, total + 1)).at[:total, :total].set(lin).at[:total, total].set(constant)
@@ -133,11 +195,11 @@ def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPar
     forces, force_cov = discretise_forces(length)
     phi = phi.at[..., size:total, size:total].set(forces)
     process_cov = process_cov.at[..., size:total, size:total].set(force_cov) if size else process_cov
-    half = full = None
+    inputs = None
     if not ssm.mean_invariant:
-        half, _ = discretise_joint(lin, jnp.zeros_like(lin), 0.5 * length / steps)
-        full = matmul(half, half)
-    return Exact(phi[..., :total, :total], process_cov[..., :total, :total], phi[..., :total, total], half, full)
+        jacobian, step = linear.rows[:, :size], length / steps
+        inputs = (jax.vmap(input_weights, (None, 0)) if is_block else input_weights)(jacobian, step)
+    return Exact(phi[..., :total, :total], process_cov[..., :total, :total], phi[..., :total, total], inputs)
 
 
 def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array, stages: bool = True,
@@ -174,8 +236,15 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
         columns = (root(0.5) * at_half, root(0.5) * inputs, root(1.0) * at_half, *columns)
     back_full = matmul(back_half, back_half)
     regressions = _regressions(columns, force_cov_half, force_cov_full)
-    return IntegratingFactor(half, full, back_half, back_full, force_cov_half, force_cov_full, inputs, columns,
-                             regressions, halves)
+    factor = IntegratingFactor(half, full, back_half, back_full, force_cov_half, force_cov_full, inputs, columns,
+                               regressions, halves)
+    if stages:
+        return factor
+    jacobian, dispersion = linear.rows[:, :size], ssm.model.process_noise
+    state_noise = None
+    if dispersion is not None and not callable(dispersion):
+        _, state_noise = discretise(jacobian, matmul(dispersion, dispersion.T), step)
+    return factor._replace(weights=input_weights(jacobian, step), state_noise=state_noise)
 
 
 def _regressions(columns: tuple[jax.Array, ...], force_cov_half: jax.Array,

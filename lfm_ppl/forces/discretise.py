@@ -5,18 +5,23 @@
 3. Compute the process noise of the substep, the integral of exp(F s) D exp(F s)', by Gauss-Legendre quadrature. The
    powers of the nodes times the terms of step 2 give exp(F s) at all nodes without further matrix products.
 4. Double s times: Q <- Q + Phi Q Phi', Phi <- Phi Phi. Sums of congruences keep Q positive semi-definite.
-5. The loop over doublings has a static length; unused iterations change nothing, so that s may be traced.
+5. `repeat` runs the doublings in blocks and skips those that no step needs, so that s may be traced and large.
+6. `phi_functions` integrates inputs that are polynomials in time, by the same series and doublings.
 
 No eigendecomposition is involved, so that repeated eigenvalues, nilpotent F and gradients need no special treatment.
 
 Source: Van Loan (1978), IEEE Transactions on Automatic Control 23(3), section II; Al-Mohy and Higham (2009), SIAM J.
-Matrix Anal. Appl. 31(3).
+Matrix Anal. Appl. 31(3); Hochbruck and Ostermann (2010), Acta Numerica 19, section 2, for the phi functions.
 """
 
 from __future__ import annotations
 
 import functools
+import math
+from collections.abc import Callable
+from typing import Any
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,13 +32,19 @@ from lfm_ppl.utils.linalg import matmul
 SUBSTEP = 0.5
 """Largest size of F h on a substep; 13 terms of the power series are then exact to rounding."""
 
+MOST_DOUBLINGS = 104
+"""Default bound on the number of doublings, for F h up to 1e31."""
+
+_BLOCK = 8
+"""Doublings that are skipped together; reverse mode stores their result alone."""
+
 _LARGEST_VECTORISED = 8
 """Largest dimension of `discretise_steps` whose products are broadcast; XLA's dot is faster above it."""
 
 
 @functools.partial(jax.jit, static_argnames="max_doublings")
 def discretise(
-    feedback: jax.Array, diffusion: jax.Array, dt: ArrayLike, max_doublings: int = 32
+    feedback: jax.Array, diffusion: jax.Array, dt: ArrayLike, max_doublings: int = MOST_DOUBLINGS
 ) -> tuple[jax.Array, jax.Array]:
     """Return transition matrix and process noise of a linear SDE over one step.
 
@@ -49,8 +60,7 @@ def discretise(
         feedback: ``F`` of shape (n, n), in 1/time.
         diffusion: ``D`` of shape (n, n), symmetric positive semi-definite.
         dt: length of the step, a scalar >= 0.
-        max_doublings: static bound on s. Each doubling doubles the admissible size of ``F dt``;
-            32 allow 2e9. The cost is linear in it: choose a smaller bound where all steps are short.
+        max_doublings: static bound on s. Each doubling doubles the admissible size of ``F dt``.
 
     Returns:
         ``Phi`` (n, n) and ``Q`` (n, n). Both are NaN where ``F dt`` needs more than `max_doublings` doublings.
@@ -66,7 +76,7 @@ def discretise(
         of Q; Al-Mohy and Higham (2009), SIAM J. Matrix Anal. Appl. 31(3), for the choice of s.
     """
     feedback, diffusion, dt = _as_arrays(feedback, diffusion, dt)
-    series, step, doublings = _substep_series(feedback, dt)
+    series, step, doublings = substep_series(feedback, dt)
     nodes, weights = _quadrature(series)
     transition = (powers(nodes, len(series))[:, :, None, None] * series).sum(1)
     integrand = matmul(matmul(transition, diffusion), transition.mT)
@@ -75,12 +85,12 @@ def discretise(
 
 
 def discretise_steps(
-    feedback: jax.Array, diffusion: jax.Array, dt: jax.Array, max_doublings: int = 32
+    feedback: jax.Array, diffusion: jax.Array, dt: jax.Array, max_doublings: int = MOST_DOUBLINGS
 ) -> tuple[jax.Array, jax.Array]:
     """Return transitions and process noises of steps of many lengths, as `discretise` does for each of them.
 
-    The powers of ``F`` are shared by all steps, and the loop over doublings skips those that no step needs. The axis of
-    the steps is the last one of all arrays, along which XLA vectorises.
+    The powers of ``F`` are shared by all steps. The axis of the steps is the last one of all arrays, along which XLA
+    vectorises.
 
     Args:
         feedback: ``F`` of shape (n, n), in 1/time.
@@ -114,16 +124,10 @@ def discretise_steps(
     integrand = _product(_product(to_end, diffusion[:, :, None, None]), to_end.swapaxes(0, 1))
     noise = step * (weights[:, None] * integrand).sum(-2)
 
-    def double_once(index: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        def doubled() -> tuple[jax.Array, jax.Array]:
-            phi, q = carry
-            is_active = index < doublings
-            longer = _product(phi, phi), q + _product(_product(phi, q), phi.swapaxes(0, 1))
-            return jnp.where(is_active, longer[0], phi), jnp.where(is_active, longer[1], q)
+    def double_once(phi: jax.Array, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _product(phi, phi), q + _product(_product(phi, q), phi.swapaxes(0, 1))
 
-        return jax.lax.cond(jnp.any(index < doublings), doubled, lambda: carry)
-
-    phi, q = jax.lax.fori_loop(0, max_doublings, double_once, (transition_over(step), noise))
+    phi, q = repeat(double_once, (transition_over(step), noise), doublings, max_doublings)
     is_complete = doublings <= max_doublings
     phi, q = jnp.where(is_complete, phi, jnp.nan), jnp.where(is_complete, 0.5 * (q + q.swapaxes(0, 1)), jnp.nan)
     return jnp.moveaxis(phi, -1, 0), jnp.moveaxis(q, -1, 0)
@@ -136,7 +140,7 @@ def _product(a: jax.Array, b: jax.Array) -> jax.Array:
 
 @functools.partial(jax.jit, static_argnames="max_doublings")
 def discretise_dispersion(
-    feedback: jax.Array, dispersion: jax.Array, dt: ArrayLike, max_doublings: int = 32
+    feedback: jax.Array, dispersion: jax.Array, dt: ArrayLike, max_doublings: int = MOST_DOUBLINGS
 ) -> tuple[jax.Array, jax.Array]:
     """Return transition matrix and process noise as `discretise` does, given ``L`` instead of ``D = L L'``.
 
@@ -158,7 +162,7 @@ def discretise_dispersion(
         3.0
     """
     feedback, dispersion, dt = _as_arrays(feedback, dispersion, dt)
-    series, step, doublings = _substep_series(feedback, dt)
+    series, step, doublings = substep_series(feedback, dt)
     return discretise_series(series, dispersion, step, doublings, max_doublings)
 
 
@@ -200,21 +204,80 @@ def double(
         transition: ``Phi`` (n, n) of the short step.
         noise: ``Q`` (n, n) of the short step.
         doublings: number of doublings, a whole number that may be traced.
-        max_doublings: static length of the loop; the result is NaN for more doublings.
+        max_doublings: static bound on their number; the result is NaN for more doublings.
 
     Returns:
         ``Phi`` (n, n) and ``Q`` (n, n) of the long step.
     """
 
-    def body(index, carry):
-        phi, q = carry
-        is_active = index < doublings
-        q_doubled = q + matmul(matmul(phi, q), phi.mT)
-        return jnp.where(is_active, matmul(phi, phi), phi), jnp.where(is_active, q_doubled, q)
+    def double_once(phi: jax.Array, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return matmul(phi, phi), q + matmul(matmul(phi, q), phi.mT)
 
-    phi, q = jax.lax.fori_loop(0, max_doublings, body, (transition, noise))
+    phi, q = repeat(double_once, (transition, noise), doublings, max_doublings)
     is_complete = doublings <= max_doublings
     return jnp.where(is_complete, phi, jnp.nan), jnp.where(is_complete, 0.5 * (q + q.mT), jnp.nan)
+
+
+def repeat(function: Callable[..., tuple], values: tuple, count: jax.Array, most: int) -> Any:
+    """Apply ``values = function(*values)`` a number of times that may be traced.
+
+    Args:
+        function: from arrays to arrays of the same shapes.
+        values: the arrays before the first application.
+        count: how often it is applied, a whole number; of many problems at once with the shape of the last axes.
+        most: static bound on ``count``.
+
+    A block of applications that no problem needs is skipped, also under ``jax.vmap``.
+    """
+
+    def apply_once(values: tuple, index: jax.Array) -> tuple[tuple, None]:
+        is_active = index < count
+        return jax.tree.map(lambda new, old: jnp.where(is_active, new, old), function(*values), values), None
+
+    def apply_block(values: tuple, first: jax.Array) -> tuple[tuple, None]:
+        indices = first + jnp.arange(_BLOCK)
+        is_needed = eqxi.unvmap_any(first < count)
+        return jax.lax.cond(is_needed, lambda: jax.lax.scan(apply_once, values, indices)[0], lambda: values), None
+
+    starts = jnp.arange(0, most, _BLOCK)
+    return jax.lax.scan(jax.checkpoint(apply_block, prevent_cse=False), values, starts)[0]
+
+
+def phi_functions(matrix: jax.Array, max_doublings: int = MOST_DOUBLINGS) -> jax.Array:
+    r"""Return exp(X) and the functions phi_1, phi_2, phi_3 of a matrix X.
+
+    They integrate inputs that are polynomials in time,
+
+        phi_k(X) = int_0^1 exp(X (1 - s)) s^(k - 1) / (k - 1)! ds,
+        phi_k(2 X) = (exp(X) phi_k(X) + sum_(0 <= j < k) phi_(k - j)(X) / j!) / 2^k.
+
+    Args:
+        matrix: X (n, n).
+        max_doublings: as in `discretise`.
+
+    Returns:
+        (4, n, n); NaN where X needs more than `max_doublings` doublings.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> [round(float(phi), 4) for phi in phi_functions(jnp.array([[-1.0]]))[:, 0, 0]]
+        [0.3679, 0.6321, 0.3679, 0.1321]
+    """
+    (matrix,) = _as_arrays(matrix)
+    series, _, doublings = substep_series(matrix, 1.0)
+    orders = range(len(series))
+    # phi_k(X) is the sum of X^j / (j + k)! over j.
+    ratios = np.array([[math.factorial(j) / math.factorial(j + k) for j in orders] for k in range(4)])
+    start = (jnp.asarray(ratios, series.dtype)[:, :, None, None] * series).sum(1)
+
+    def double_once(phi: jax.Array) -> tuple[jax.Array]:
+        exponential, first, second, third = matmul(phi[:1], phi)
+        _, phi1, phi2, phi3 = phi
+        return (jnp.stack([exponential, (first + phi1) / 2, (second + phi2 + phi1) / 4,
+                           (third + phi3 + phi2 + phi1 / 2) / 8]),)
+
+    (phi,) = repeat(double_once, (start,), doublings, max_doublings)
+    return jnp.where(doublings <= max_doublings, phi, jnp.nan)
 
 
 def step_tangent(
@@ -267,7 +330,7 @@ def _as_arrays(*values):
     return tuple(jnp.asarray(value, dtype) for value in values)
 
 
-def _substep_series(feedback, dt):
+def substep_series(feedback, dt):
     """Return the terms ``(F h)^k / k!`` of the power series on the substep, the substep h and the doublings s."""
     doublings = doublings_for(_growth(jax.lax.stop_gradient(feedback * dt)))
     step = dt * jnp.exp2(-doublings)

@@ -67,7 +67,8 @@ class MarginalLikelihood(SeriesLikelihood):
         damping: largest share of each new iterate that is taken; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations. With it the length of the steps follows
             the moments, for every parameter anew, for posteriors over slow and fast models; up to five times ``steps``
-            are tried. None: ``steps`` equal steps. Not with ``iterations``.
+            are tried. None: ``steps`` equal steps. Not with ``iterations``. A linear model has exact transitions, with
+            equal steps over its known inputs.
         sites: of an observation family, how its sites are refined: "ep" (expectation propagation, the default),
             "variational", "laplace", or `lfm_ppl.SiteSettings`. The log density is then the log evidence of the
             converged sites. Where the model is not linear it is linearised about smoothed moments, ``iterations`` times
@@ -158,7 +159,13 @@ class MarginalLikelihood(SeriesLikelihood):
         if self.is_family:
             return f"approximate (sites by {self.sites_in_words})"
         if self.is_affine:
-            return "exact (the model is linear)"
+            if self.ssm.is_integrated_exactly:
+                return "exact (the model is linear)"
+            if self.ssm.has_constant_coefficients:
+                ignored = "" if self.tolerance is None else "; tolerance has no effect"
+                return f"exact transitions, known inputs integrated in {self.steps} steps between two times{ignored}"
+            return "linear model, integrated " + (f"in {self.steps} steps between two times" if self.tolerance is None
+                                                  else f"with tolerance {self.tolerance:g}")
         if not self.iterations:
             return "approximate (a single pass of the filter)"
         count = {1: "one iteration", 2: "two iterations", 3: "three iterations"}.get(

@@ -27,6 +27,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.forces.discretise import phi_functions
+
 
 class CutCells(eqx.Module):
     """The C cells that each of T observations needs, (T, C), cut to [a, b] in (t_(k-1), t_k].
@@ -113,11 +115,8 @@ def scalar_integrals(z: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def matrix_integrals(jacobian: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return e^(A h), 1/h int_0^h e^(A (h - s)) ds and 1/h int_0^h e^(A (h - s)) s/h ds, from one exponential."""
-    size = jacobian.shape[0]
-    eye, zero = jnp.eye(size), jnp.zeros((size, size))
-    block = jnp.block([[jacobian * length, eye, zero], [zero, zero, eye], [zero, zero, zero]])
-    exponential = jax.scipy.linalg.expm(block)
-    return exponential[:size, :size], exponential[:size, size:2 * size], exponential[:size, 2 * size:]
+    exponential, constant, linear, _ = phi_functions(jacobian * length)
+    return exponential, constant, linear
 
 
 def map_distinct(function: Any, lengths: np.ndarray) -> Any:

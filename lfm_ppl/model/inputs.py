@@ -274,6 +274,11 @@ def has_inputs(function: TracedFunction, is_limited: bool = False) -> bool:
     return any(_MARK in name and not (is_limited and _settings(name)[1] == "hold") for name in function.names())
 
 
+def interpolation_of(name: str) -> str | None:
+    """Return the interpolation of the known input that a function of this name reads; None for any other function."""
+    return _settings(name)[0] if _MARK in name else None
+
+
 def _settings(name: str) -> list[str]:
     """Return interpolation, policy outside and name of the input from the name of its reader."""
     return name[name.index(_MARK) + len(_MARK):].split("_", 2)

@@ -27,6 +27,7 @@ from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.inputs import InputRead, check_reads, has_inputs, input_reads
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.model.time_degree import degree_in_time
 from lfm_ppl.model.user_functions import TracedFunction, own_functions, trace
 from lfm_ppl.utils import checks
 
@@ -268,6 +269,11 @@ class LatentForceModel(eqx.Module):
         """Return the reads of known inputs between observations, see `lfm_ppl.model.inputs.input_reads`."""
         functions = _integrated_functions(self.traced_functions()) if self._has_integrated_inputs else []
         return input_reads(functions, first, last)
+
+    @property
+    def has_quadratic_inputs(self) -> bool:
+        """Whether what is integrated is at most quadratic in time, between breakpoints of its known inputs."""
+        return all(degree_in_time(function) <= 2.0 for function in _integrated_functions(self._trace_functions()))
 
     def _check_finite(self, time: Any) -> None:
         """Evaluate the functions at the prior mean, if it is concrete; ``time`` is None if it does not matter."""

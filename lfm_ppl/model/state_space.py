@@ -131,11 +131,20 @@ class StateSpaceModel(eqx.Module):
         return state_maps(self.model.events, self.model.state_names, self.state_dim)
 
     @property
+    def has_constant_coefficients(self) -> bool:
+        """Whether the dynamics is linear, and only additive terms of the mean and the dispersion depend on time."""
+        uses_forces = any(any(row[self.physical_dim:]) for row in self.drift_structure.jacobian)
+        return self.drift_structure.linear and (self.constant_measurement or not uses_forces)
+
+    @property
     def time_invariant(self) -> bool:
         """Whether the model is linear with constant coefficients, except for additive terms in the mean."""
-        uses_forces = any(any(row[self.physical_dim:]) for row in self.drift_structure.jacobian)
-        has_constant_inputs = self.constant_measurement or not uses_forces
-        return self.drift_structure.linear and has_constant_inputs and not callable(self.model.process_noise)
+        return self.has_constant_coefficients and not callable(self.model.process_noise)
+
+    @property
+    def is_integrated_exactly(self) -> bool:
+        """Whether the moments are exact: linear, with inputs at most quadratic in time between their breakpoints."""
+        return self.mean_invariant or (self.has_constant_coefficients and self.model.has_quadratic_inputs)
 
     @property
     def mean_invariant(self) -> bool:

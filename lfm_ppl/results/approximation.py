@@ -70,7 +70,7 @@ def more_iterations(example: SeriesLikelihood) -> Refinement | None:
 
 def shorter_steps(example: SeriesLikelihood) -> Refinement | None:
     """Return half the integration step; None where nothing is integrated, or where constraints fix the steps."""
-    if isinstance(example, ConstrainedLikelihood) or all(ssm.mean_invariant for ssm in example.ssms):
+    if isinstance(example, ConstrainedLikelihood) or all(ssm.is_integrated_exactly for ssm in example.ssms):
         return None
     settings = likelihoods.finer_steps(example)
     arguments = ", ".join(f"{name}={value:g}" for name, value in settings.items())
@@ -133,7 +133,7 @@ def _long_steps(likelihood: SeriesLikelihood) -> list[str]:
     length = checks.concrete(grid.intervals.length)
     lengthscales = [float(force.lengthscale) for force in jax.tree_util.tree_leaves(
         likelihood.model.forces, is_leaf=lambda part: isinstance(part, Stretched)) if isinstance(force, Stretched)]
-    is_exact = likelihood.tolerance is not None or all(ssm.time_invariant for ssm in likelihood.ssms)
+    is_exact = likelihood.tolerance is not None or all(ssm.has_constant_coefficients for ssm in likelihood.ssms)
     if is_exact or length is None or not lengthscales:
         return []
     step, longest = float(length.max()) / grid.steps, 0.5 * min(lengthscales)

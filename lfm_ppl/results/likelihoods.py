@@ -141,9 +141,12 @@ class ReferenceSettings:
 
 
 def is_exact(ssm: StateSpaceModel) -> bool:
-    """Whether the Gaussian filter computes the exact likelihood: linear dynamics and observation, Gaussian noise."""
+    """Whether the Gaussian filter computes the exact likelihood, up to the integration of known inputs.
+
+    Dynamics and observation are linear then, with constant coefficients and Gaussian noise.
+    """
     is_family = isinstance(ssm.model.observation, ObservationFamily)
-    return ssm.time_invariant and not is_family and not is_observation_nonlinear(ssm)
+    return ssm.has_constant_coefficients and not is_family and not is_observation_nonlinear(ssm)
 
 
 def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods", **settings: Any) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -11,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr
 
+from lfm_ppl.forces.discretise import MOST_DOUBLINGS, repeat, substep_series
 from lfm_ppl.switching.rule import SwitchingRule
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.linalg import matmul
 
 
 def check_rates(rates: Any, count: int) -> jax.Array:
@@ -61,10 +62,18 @@ def check_probabilities(probabilities: Any, count: int) -> jax.Array:
 
 def transition_matrices(rates: jax.Array, lengths: jax.Array) -> jax.Array:
     """Return the transition probabilities exp(rates dt) (N, K, K) over times ``lengths`` (N,)."""
-    # Many squarings for rates that are fast compared with the data.
-    exponential = functools.partial(jax.scipy.linalg.expm, max_squarings=48)
-    probabilities = jnp.maximum(jax.vmap(lambda length: exponential(rates * length))(lengths), 0.0)
-    return probabilities / probabilities.sum(-1, keepdims=True)
+
+    def normalised(probabilities: jax.Array) -> jax.Array:
+        return probabilities / probabilities.sum(-1, keepdims=True)
+
+    def transition(length: jax.Array) -> jax.Array:
+        series, _, doublings = substep_series(rates, length)
+        # Each squaring would double the error of the sums of the rows, for rates that are fast compared with the data.
+        (probabilities,) = repeat(lambda p: (normalised(matmul(p, p)),),
+                                  (normalised(jnp.maximum(series.sum(0), 0.0)),), doublings, MOST_DOUBLINGS)
+        return jnp.where(doublings <= MOST_DOUBLINGS, probabilities, jnp.nan)
+
+    return jax.vmap(transition)(lengths)
 
 
 class MarkovChain(SwitchingRule):

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 from jax.test_util import check_grads
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lfm_ppl.forces.discretise import discretise, discretise_dispersion, discretise_steps
+from lfm_ppl.forces.discretise import discretise, discretise_dispersion, discretise_steps, phi_functions
 
 step = jax.jit(discretise, static_argnums=3)
 DTS = np.array([1e-6, 0.1, 1.0, 4.0])
@@ -137,3 +138,49 @@ def test_gradients_of_many_steps():
 
     arguments = (jnp.asarray(SYSTEMS["repeated root"]), jnp.eye(3), jnp.array([0.0, 1e-9, 0.3, 3.0]))
     check_grads(jax.jit(flow), arguments, order=1, modes=("fwd", "rev"), eps=1e-5, rtol=1e-6, atol=1e-7)
+
+
+def test_steps_of_any_length():
+    """Rates times steps far above 2^32, alone, among many lengths, and with the derivatives."""
+    feedback, diffusion = jnp.array([[-1.0, 3.0], [0.0, -1.5]]), jnp.diag(jnp.array([2.0, 1.0]))
+    lengths = jnp.array([0.5, 1e8, 1e12, 1e30])
+
+    @jax.jit
+    def results(rate):
+        return [*jax.vmap(lambda dt: discretise(rate * feedback, rate * diffusion, dt))(lengths),
+                *discretise_steps(rate * feedback, rate * diffusion, lengths)]
+
+    phi, noise, phi_steps, noise_steps = results(1.0)
+    assert_allclose(phi_steps, phi, atol=1e-14)
+    assert_allclose(noise_steps, noise, rtol=1e-13)
+    assert_allclose(phi[1:], 0.0, atol=1e-30)
+    balance = feedback @ noise[1:] + noise[1:] @ feedback.T
+    assert_allclose(balance, np.tile(-diffusion, (3, 1, 1)), atol=1e-12)
+    for differentiate in (jax.jacfwd, jax.jacrev):
+        derivatives = jax.jit(differentiate(results))(1.0)
+        assert all(np.isfinite(derivative).all() for derivative in derivatives)
+        assert_allclose(derivatives[1][1:], 0.0, atol=1e-9)  # rate and noise grow together
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_phi_functions_equal_the_augmented_exponential(name):
+    size = len(SYSTEMS[name])
+    for scale in (1e-6, 0.3, 4.0):
+        matrix = scale * SYSTEMS[name]
+        augmented = np.kron(np.diag(np.ones(3), 1), np.eye(size))
+        augmented[:size, :size] = matrix
+        expected = scipy.linalg.expm(augmented)[:size].reshape(size, 4, size).swapaxes(0, 1)
+        unit = np.abs(expected).max(axis=(1, 2), keepdims=True)
+        assert_allclose(phi(matrix) / unit, expected / unit, atol=2e-13)
+
+
+phi = jax.jit(phi_functions)
+
+
+def test_phi_functions_of_fast_decays():
+    """They tend to 1/z, 1/z and 1/(2 z); the derivatives are those of differences."""
+    rates = np.array([1e4, 1e9, 1e15, 1e30])
+    values = jax.jit(jax.vmap(phi_functions))(-rates[:, None, None])[:, :, 0, 0]
+    expected = np.stack([0 * rates, 1 / rates, (1 - 1 / rates) / rates, (0.5 - (1 - 1 / rates) / rates) / rates], 1)
+    assert_allclose(values, expected, rtol=1e-12)
+    check_grads(phi_functions, (jnp.array([[-3.0, 1.0], [0.2, -8.0]]),), order=1, modes=("fwd", "rev"), rtol=1e-6)

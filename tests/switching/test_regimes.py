@@ -389,3 +389,20 @@ def test_models_of_another_type_are_refused():
         lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
     with pytest.raises(ValueError, match="GaussianObservation"):
         lfm.Switching({"a": counts, "b": counts}, RATES, np.arange(3.0))
+
+
+def test_transitions_of_rates_that_are_fast_compared_with_the_rows():
+    """The stationary distribution in every row, however long the time, with the derivative in a rate."""
+    def transitions(rate, lengths):
+        rates = jnp.array([[-rate, rate, 0.0], [1.0, -3.0, 2.0], [0.0, 4.0, -4.0]])
+        return transition_matrices(rates, jnp.asarray(lengths))
+
+    short = np.array([0.0, 0.3, 5.0])
+    expected = [scipy.linalg.expm(np.array([[-0.5, 0.5, 0.0], [1.0, -3.0, 2.0], [0.0, 4.0, -4.0]]) * h) for h in short]
+    np.testing.assert_allclose(jax.jit(transitions)(0.5, short), expected, atol=1e-14)
+    long = np.array([1e3, 1e9, 1e16, 1e30])
+    stationary = np.array([1.0, 0.5, 0.25]) / 1.75
+    derivative = np.array([-1.5, 1.0, 0.5]) / 1.75**2
+    value, slope = jax.jit(lambda rate: (transitions(rate, long), jax.jacfwd(transitions)(rate, long)))(0.5)
+    np.testing.assert_allclose(value, np.broadcast_to(stationary, (4, 3, 3)), rtol=1e-12)
+    np.testing.assert_allclose(slope, np.broadcast_to(derivative, (4, 3, 3)), rtol=1e-9)
