@@ -223,7 +223,7 @@ class Switching(SeriesLikelihood):
     def _smooth(self, y: jax.Array, grid: TimeGrid) -> RegimeSmootherResult:
         regimes, requested = self.regimes(grid), jnp.asarray(grid.requested)
         trace = filter_regimes(regimes, y)
-        paths, probability = sample_regimes(jax.random.key(0), regimes, trace, SMOOTHER_DRAWS)
+        paths, probability = sample_regimes(jax.random.key(0), regimes, trace, y, SMOOTHER_DRAWS)
 
         def smooth(path: jax.Array) -> Moments:
             # The nodes of the smoother begin with the initial time.
@@ -243,7 +243,7 @@ class Switching(SeriesLikelihood):
         """
         regimes, observed = self.regimes(), jnp.asarray(self.time_grid.observed)
         trace = filter_regimes(regimes, y)
-        path = sample_regimes(key, regimes, trace, 1)[0][:, 0]
+        path = sample_regimes(key, regimes, trace, y, 1)[0][:, 0]
         left_out = smooth_path(regimes, y, path).leave_one_out
         return {"leave_one_out": left_out[observed], "one_step_ahead": trace.log_likelihood[observed],
                 "residual": trace.residual[observed]}
@@ -256,7 +256,7 @@ class Switching(SeriesLikelihood):
         grid = self.time_grid if at is None else self._grid(at)
         regimes, requested = self.regimes(grid), jnp.asarray(grid.requested)
         path_key, state_key = jax.random.split(key)
-        path = sample_regimes(path_key, regimes, filter_regimes(regimes, y), 1)[0][:, 0]
+        path = sample_regimes(path_key, regimes, filter_regimes(regimes, y), y, 1)[0][:, 0]
         states = sample_states(state_key, regimes, y, path)[requested]
         indices, times = path[requested], jnp.asarray(grid.requested_times, float)
         candidates = jnp.stack([jax.vmap(ssm.inputs)(states, times) for ssm in self.ssms])

@@ -9,18 +9,22 @@ it (GPBn; GPB2 and IMM have one history, so that a source is a regime). For each
    by their moments, too, with the weights c_ij / sum_i c_ij, and takes K filters.
 3. The one-step-ahead density is the mixture sum_ij c_ij N(y_k; mu_ij, S_ij), whose terms are the new weights.
 
-From the last interval to the first, for each of S draws of the later state s_k+1 and its regime j,
+From the last interval to the first, for each of S draws of the later regimes r_k+1, r_k+2, ...,
 
-4. p(i | s_k+1, j, y) is proportional to c_ij N(s_k+1; m_ij, P_ij), with the predictions (i, j) from the merged states,
-   and the smoother's gain gives the Gaussian of s_k given i. Both are drawn from this law, which is exact given the
-   merged states. After the last observation the chain is simulated.
+4. the density of the later observations given the later regimes is Gaussian in s_k, with the state integrated out
+   (`FutureLikelihood`). p(i | r_k+1, ..., y) is proportional to c_ij N(y_k+1; mu_ij, S_ij) times the integral of that
+   density over the filtered state of (i, j), with the predictions (i, j) from the merged states. The regime is drawn
+   from this law, which is exact given the merged states: only the past is merged. No state is drawn before the path,
+   since a later state pins an earlier one where there is no process noise, and the merged Gaussian does not hold there.
+   After the last observation the chain is simulated.
 5. Given a path of regimes the model is that of one filter: its trace goes to the backward scan of the smoother, and
    draws of the state are exact.
 
 The index of a source is ``regime * M + history``, and that of a history has the oldest regime last.
 
 Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8), for IMM; Tugnait (1982), Automatica
-18(5), for GPBn; Carter and Kohn (1994), Biometrika 81(3), for the draws.
+18(5), for GPBn; Lindsten, Bunch, Sarkka, Schon and Godsill (2016), IEEE Journal of Selected Topics in Signal Processing
+10(2), for the draws.
 """
 
 from __future__ import annotations
@@ -37,23 +41,18 @@ from jax.scipy.special import logsumexp, ndtr, ndtri
 from lfm_ppl.filtering.backward import SmootherTrace, backward
 from lfm_ppl.filtering.forward import FilterTrace, predict, update_at_end
 from lfm_ppl.filtering.intervals import TimeGrid, as_arrays, with_observations
-from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.moments import Moments, Prediction, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem
 from lfm_ppl.filtering.sample import sample_errors
-from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
-from lfm_ppl.filtering.update import GaussianUpdate
+from lfm_ppl.filtering.update import GaussianUpdate, Update
 from lfm_ppl.switching.chain import transition_matrices
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gaussian_residuals import log_density
-from lfm_ppl.utils.linalg import cholesky, diagonal, semidefinite_root, solve_lower
+from lfm_ppl.utils.linalg import cholesky, congruence, matmul, solve_lower
 
 MERGINGS = {"imm": 0, "gpb2": 1, "gpb3": 2, "gpb4": 3}
 """Methods of merging -> number of latest regimes for whose histories there are states; 0: merged before the prediction.
 """
-
-_JITTER = 1e-10
-"""Relative variance added to a predicted covariance whose density is compared between regimes: it may be singular."""
-
 
 class RegimeProblem(NamedTuple):
     """A filter problem for each regime on a common time grid, and the Markov chain.
@@ -102,6 +101,52 @@ class RegimeTrace(NamedTuple):
     log_likelihood: jax.Array
     filtered: RegimeMoments
     residual: jax.Array
+
+
+class FutureLikelihood(NamedTuple):
+    """The density of all later observations given the state s and the later regimes, up to a factor.
+
+    It is that of n observations with unit noise, exp(-|value - jacobian (s - point)|^2 / 2), in the square-root form of
+    the information filter: neither the process noise nor the state's covariance is inverted, so that both may be zero.
+
+    Attributes:
+        value: (n,).
+        jacobian: (n, n).
+        point: (n,).
+    """
+
+    value: jax.Array
+    jacobian: jax.Array
+    point: jax.Array
+
+    def log_density(self, mean: jax.Array, covariance: jax.Array) -> jax.Array:
+        """Return the log density of the later observations given that s ~ N(mean, covariance)."""
+        residual = self.value - matvec(self.jacobian, mean - self.point)
+        chol = cholesky(jnp.eye(len(mean)) + congruence(self.jacobian, covariance)).chol
+        return log_density(solve_lower(chol, residual), chol)
+
+    def with_observation(self, predicted_mean: jax.Array, update: Update) -> FutureLikelihood:
+        """Return the density with the observation of ``update`` among the later ones."""
+        # An observation without noise gets one that is lost in the rounding of its innovation covariance.
+        rounding = jnp.finfo(update.chol.dtype).eps * (update.chol**2).sum(-1)
+        chol = cholesky(update.obs_cov + jnp.diag(rounding)).chol
+        residual = self.value - matvec(self.jacobian, predicted_mean - self.point)
+        rows = jnp.block([[self.jacobian, residual[:, None]],
+                          [solve_lower(chol, update.jacobian), solve_lower(chol, update.innovation)[:, None]]])
+        # A rotation leaves the sum of squares; the last row has no coefficients of s.
+        reduced = jnp.linalg.qr(rows, mode="r")[:len(residual)]
+        return FutureLikelihood(reduced[:, -1], reduced[:, :-1], predicted_mean)
+
+    def at_start(self, mean: jax.Array, prediction: Prediction) -> FutureLikelihood:
+        """Return the density as a function of the state at the start of an interval.
+
+        Args:
+            mean: of the state at the start, whose prediction has the mean ``point``.
+            prediction: over the interval.
+        """
+        chol = cholesky(jnp.eye(len(mean)) + congruence(self.jacobian, prediction.process_cov)).chol
+        jacobian = solve_lower(chol, matmul(self.jacobian, prediction.phi))
+        return FutureLikelihood(solve_lower(chol, self.value), jacobian, mean)
 
 
 def merge(weights: jax.Array, moments: Moments) -> Moments:
@@ -216,58 +261,55 @@ def _enter_regimes(filtered: RegimeMoments, transition: jax.Array, memory: int) 
     return RegimeMoments(joint.sum(1, keepdims=True), jax.tree.map(lambda a: a[:, None], merged))
 
 
-def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace,
+def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace, y: jax.Array,
                    draws: int) -> tuple[jax.Array, jax.Array]:
-    """Draw paths of regimes given the observations.
+    """Draw paths of regimes given the observations (T, D), with the state integrated out.
 
     Returns:
         The paths (N, S) and the probabilities (N, K) of the regimes, at the ends of the intervals.
     """
     filtered, last = trace.filtered, max(regimes.grid.observed)
-    histories = filtered.probability.shape[2]
+    histories, size = filtered.probability.shape[2], filtered.moments.mean.shape[-1]
+    updater = GaussianUpdate(y)
+    updates = [updater.bind(problem, problem.initial()) for problem in regimes.problems]
+    rows = with_observations(regimes.grid.intervals, updater.rows())[1]
     keys = jax.random.split(key, (len(trace.log_likelihood), draws))
 
-    def step(later: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
-        filtered, keys, transition, intervals = inputs
+    def step(later: tuple[FutureLikelihood, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
+        filtered, keys, transition, intervals, row = inputs
         joint, sources = _enter_regimes(filtered, transition, 1)
-        sources = jax.tree.map(lambda a: a[0], sources)  # they are the same for all regimes
-        predictions = []
-        for problem, interval in zip(regimes.problems, intervals, strict=True):
-            predicted = jax.vmap(functools.partial(predict, problem, interval, record=Record.SMOOTHER))(sources)
-            kernel = jax.vmap(smoothing_kernel)(sources, predicted.moments, predicted.phi, predicted.process_cov)
-            predictions.append((predicted.moments, kernel.gain, jax.vmap(semidefinite_root)(kernel.conditional)))
-        by_regime = joint, _stack(predictions)
+        by_regime = []
+        for j, (problem, update, interval) in enumerate(zip(regimes.problems, updates, intervals, strict=True)):
+            source = Moments(sources.mean[j], sources.covariance[j])
+            prediction = jax.vmap(functools.partial(predict, problem, interval, record=Record.SMOOTHER))(source)
+            updated = jax.vmap(functools.partial(update_at_end, problem, update, interval, row))(prediction.moments)
+            by_regime.append((joint[j], source, prediction, updated))
+        stacked = _stack(by_regime)
 
-        def draw(key: jax.Array, state: jax.Array, regime: jax.Array) -> tuple[tuple, jax.Array]:
-            weights, (predicted, gain, root) = jax.tree.map(lambda a: a[regime], by_regime)
-            probability = _source_probabilities(weights, predicted, state)
-            source_key, state_key = jax.random.split(key)
-            source = jax.random.categorical(source_key, _log(probability))
-            mean = sources.mean[source] + gain[source] @ (state - predicted.mean[source])
-            state = mean + root[source] @ jax.random.normal(state_key, mean.shape)
-            return (state, source // histories), probability.reshape(-1, histories).sum(1)
+        def draw(key: jax.Array, future: FutureLikelihood, regime: jax.Array) -> tuple[tuple, jax.Array]:
+            weights, source, prediction, updated = jax.tree.map(lambda a: a[regime], stacked)
+            log_weight = _log(weights) + updated.log_likelihood + jax.vmap(future.log_density)(*updated.moments)
+            probability = _normalised(log_weight, weights)
+            index = jax.random.categorical(key, _log(probability))
+            source, prediction, updated = jax.tree.map(lambda a: a[index], (source, prediction, updated))
+            future = future.with_observation(prediction.moments.mean, updated).at_start(source.mean, prediction)
+            return (future, index // histories), probability.reshape(-1, histories).sum(1)
 
         earlier, probability = jax.vmap(draw)(keys, *later)
         return earlier, (earlier[1], probability.mean(0))
-
-    def draw_last(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        source_key, state_key = jax.random.split(key)
-        probability, moments = jax.tree.map(lambda a: a[last].reshape(-1, *a.shape[3:]), filtered)
-        source = jax.random.categorical(source_key, _log(probability))
-        normal = jax.random.normal(state_key, moments.mean[source].shape)
-        return moments.mean[source] + semidefinite_root(moments.covariance[source]) @ normal, source // histories
 
     def simulate(regime: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         transition, keys = inputs
         regime = jax.vmap(jax.random.categorical)(keys, _log(transition[regime]))
         return regime, regime
 
-    end = jax.vmap(draw_last)(keys[last])
+    end = jax.vmap(jax.random.categorical, (0, None))(keys[last], _log(filtered.probability[last].sum(1)))
+    nothing = FutureLikelihood(jnp.zeros((draws, size)), jnp.zeros((draws, size, size)), jnp.zeros((draws, size)))
     inputs = (*jax.tree.map(lambda a: a[:last], (filtered, keys)),
-              *jax.tree.map(lambda a: a[1:last + 1], (regimes.transitions, regimes.intervals)))
-    earlier, probability = jax.lax.scan(step, end, inputs, reverse=True)[1]
-    later = jax.lax.scan(simulate, end[1], (regimes.transitions[last + 1:], keys[last + 1:]))[1]
-    return (jnp.concatenate([earlier, end[1][None], later]),
+              *jax.tree.map(lambda a: a[1:last + 1], (regimes.transitions, regimes.intervals, rows)))
+    earlier, probability = jax.lax.scan(step, (nothing, end), inputs, reverse=True)[1]
+    later = jax.lax.scan(simulate, end, (regimes.transitions[last + 1:], keys[last + 1:]))[1]
+    return (jnp.concatenate([earlier, end[None], later]),
             jnp.concatenate([probability, filtered.probability[last:].sum(2)]))
 
 
@@ -278,17 +320,8 @@ def sample_states(key: jax.Array, regimes: RegimeProblem, y: jax.Array, path: ja
     return smoothed + sample_errors(key, trace, 1)[:, :, 0]
 
 
-def _source_probabilities(weights: jax.Array, predicted: Moments, state: jax.Array) -> jax.Array:
-    """Return the probabilities (K M,) of the sources from which the later ``state`` (n,) came."""
-
-    def density(mean: jax.Array, covariance: jax.Array) -> jax.Array:
-        # A known coordinate gets a width far below its size and above its rounding errors.
-        sd = jnp.sqrt(diagonal(covariance)) + 1e-8 * jnp.abs(state) + 1e-150
-        scaled = covariance / (sd[:, None] * sd) + _JITTER * jnp.eye(sd.shape[0])
-        chol = cholesky(scaled).chol
-        return log_density(solve_lower(chol, (state - mean) / sd), chol) - jnp.log(sd).sum()
-
-    log_weight = _log(weights) + jax.vmap(density)(*predicted)
+def _normalised(log_weight: jax.Array, weights: jax.Array) -> jax.Array:
+    """Return the probabilities (K M,) of the sources; those before the data, where the data are impossible."""
     log_weight = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
     is_possible = jnp.isfinite(log_weight).any()
     return jnp.where(is_possible, jax.nn.softmax(jnp.where(is_possible, log_weight, 0.0)),
