@@ -6,8 +6,8 @@
 4. `sample_path` draws states and regimes given the data; `lfm_ppl.fit` stores such paths.
 5. `sample` simulates the real model by `switching.switched_simulation`, with the chain as its rule.
 
-Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8); Carter and Kohn (1994), Biometrika
-81(3).
+Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8); Lindsten and others (2016), IEEE
+Journal of Selected Topics in Signal Processing 10(2).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.breakdown import FilterWarning
-from lfm_ppl.filtering.intervals import TimeGrid
+from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -96,6 +96,7 @@ class Switching(SeriesLikelihood):
         initial: (K,), probabilities of the regimes at the first observation; None: equal ones.
         merging: "gpb2", K^2 filters a row; "gpb3" and "gpb4", K^3 and K^4 filters, for regimes whose states stay
             apart; or "imm", K filters, which is faster and merges earlier.
+        method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
 
     Raises:
         ValueError, TypeError: models of other states or outputs; rates or probabilities that are none; and as
@@ -117,22 +118,24 @@ class Switching(SeriesLikelihood):
         (('calm', 'rough'), (5, 2))
 
     Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8), for IMM; Tugnait (1982),
-    Automatica 18(5), for GPBn; Carter and Kohn (1994), Biometrika 81(3), for the draws.
+    Automatica 18(5), for GPBn; Lindsten and others (2016), IEEE Journal of Selected Topics in Signal Processing 10(2),
+    for the draws.
     """
 
     pytree_data_fields = ("models", "rates", "initial")
-    pytree_aux_fields = ("regime_names", "merging", "max_step")
+    pytree_aux_fields = ("regime_names", "merging", "max_step", "method")
 
     def __init__(self, models: Mapping[str, LatentForceModel], rates: ArrayLike, times: ArrayLike,
                  rule: Rule | None = None, steps: int = 10, max_step: float | None = None, *,
-                 initial: ArrayLike | None = None, merging: str = "gpb2") -> None:
+                 initial: ArrayLike | None = None, merging: str = "gpb2", method: str = RUNGE_KUTTA) -> None:
         checks.one_of("merging", merging, MERGINGS)
+        checks.one_of("method", method, METHODS)
         by_name = check_models(models)
         count = len(by_name)
         self.models, self.regime_names = tuple(by_name.values()), tuple(by_name)
         self.rates = check_rates(rates, count)
         self.initial = check_probabilities(jnp.full(count, 1.0 / count) if initial is None else initial, count)
-        self.merging, self.max_step = merging, max_step
+        self.merging, self.max_step, self.method = merging, max_step, method
         super().__init__(joint_model(by_name, self.initial), times, rule, steps)
 
     @property
@@ -143,11 +146,11 @@ class Switching(SeriesLikelihood):
     @property
     def settings(self) -> dict[str, Any]:
         """Arguments besides models, rates and times."""
-        return {name: getattr(self, name) for name in ("rule", "steps", "max_step", "initial", "merging")}
+        return {name: getattr(self, name) for name in ("rule", "steps", "max_step", "initial", "merging", "method")}
 
     def with_settings(self, **settings: Any) -> Switching:
-        """Return the same distribution with another ``rule``, ``steps`` or ``max_step``."""
-        names = ("rule", "steps", "max_step")
+        """Return the same distribution with another ``rule``, ``steps``, ``max_step`` or ``method``."""
+        names = ("rule", "steps", "max_step", "method")
         for name in settings:
             if name not in names:
                 raise ValueError(f"{name} is not a setting of lfm.Switching, whose settings are {', '.join(names)}.")
@@ -249,7 +252,8 @@ class Switching(SeriesLikelihood):
                 "residual": trace.residual[observed]}
 
     def _grid(self, at: Any, steps: int | None = None) -> TimeGrid:
-        return build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at)
+        steps = self.steps if steps is None else steps
+        return build_time_grid(self.ssm, self.times, steps, self.max_step, at)._replace(method=self.method)
 
     def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
         """Draw a trajectory given the data, whose state is (x, indicators of the regimes); see the base class."""
