@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import logsumexp, ndtr, ndtri
+from jax.scipy.special import ndtr, ndtri
 
 from lfm_ppl.filtering.backward import SmootherTrace, backward
 from lfm_ppl.filtering.forward import FilterTrace, predict, update_at_end
@@ -54,6 +54,15 @@ MERGINGS = {"imm": 0, "gpb2": 1, "gpb3": 2, "gpb4": 3}
 """Methods of merging -> number of latest regimes for whose histories there are states; 0: merged before the prediction.
 """
 
+_VANISHING_RATE, _VANISHING_PROBABILITY = 1e-60, 1e-120
+"""A rate and an initial probability in place of zero. With them a regime of probability zero has a state, the limit for
+rates that tend to zero, on which the derivative with respect to a rate of zero depends."""
+
+_LARGEST_EXPONENT, _LARGEST_LIMIT = 700.0, 1e200
+"""Bounds of the density and the limit of a regime of probability zero, which overflow in data that contradict the
+others."""
+
+
 class RegimeProblem(NamedTuple):
     """A filter problem for each regime on a common time grid, and the Markov chain.
 
@@ -61,6 +70,7 @@ class RegimeProblem(NamedTuple):
         problems: of the K regimes.
         initial: (K,), probabilities of the regimes at the first observation.
         transitions: (N, K, K), probabilities p(r_k = j | r_k-1 = i) at the starts of the intervals.
+        limit_transitions: (N, K, K), the same with `_VANISHING_RATE` in place of rates of zero.
         is_start: (N,), whether an interval is the first after an observation, so that the regime may change.
         memory: one of the values of `MERGINGS`.
     """
@@ -68,6 +78,7 @@ class RegimeProblem(NamedTuple):
     problems: tuple[FilterProblem, ...]
     initial: jax.Array
     transitions: jax.Array
+    limit_transitions: jax.Array
     is_start: jax.Array
     memory: int
 
@@ -83,10 +94,17 @@ class RegimeProblem(NamedTuple):
 
 
 class RegimeMoments(NamedTuple):
-    """Probabilities (..., K, M) of the K regimes and M histories before each, and moments of the state given them."""
+    """Probabilities of the K regimes and M histories before each, and moments of the state given them.
+
+    Attributes:
+        probability: (..., K, M).
+        moments: (..., K, M).
+        limit: (..., K, M), ``probability`` with `_VANISHING_RATE` in place of rates of zero, without derivative.
+    """
 
     probability: jax.Array
     moments: Moments
+    limit: jax.Array
 
 
 class RegimeTrace(NamedTuple):
@@ -151,6 +169,8 @@ class FutureLikelihood(NamedTuple):
 
 def merge(weights: jax.Array, moments: Moments) -> Moments:
     """Return the moments of a mixture; ``weights`` (S,) need not be normalised, and zeros alone count as equal."""
+    largest = jax.lax.stop_gradient(weights.max())
+    weights = weights / jnp.where(largest > 0, largest, 1.0)  # the derivative of a share has the square of their sum
     total = weights.sum()
     share = jnp.where(total > 0, weights / jnp.where(total > 0, total, 1.0), 1.0 / weights.shape[0])
     mean = share @ moments.mean
@@ -159,8 +179,8 @@ def merge(weights: jax.Array, moments: Moments) -> Moments:
     return Moments(mean, covariance)
 
 
-def regime_transitions(rates: jax.Array, grid: TimeGrid) -> tuple[jax.Array, jax.Array]:
-    """Return the fields ``transitions`` and ``is_start`` of a `RegimeProblem`.
+def regime_transitions(rates: jax.Array, grid: TimeGrid) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the fields ``transitions``, ``limit_transitions`` and ``is_start`` of a `RegimeProblem`.
 
     The regime is constant between two observations: the first interval after an observation carries the transition over
     the whole time to the next, other intervals the identity. After the last observation each interval is a transition.
@@ -177,10 +197,14 @@ def regime_transitions(rates: jax.Array, grid: TimeGrid) -> tuple[jax.Array, jax
     is_start = np.append(True, is_end[:-1])
     group = np.cumsum(is_start) - 1
     dwell = jax.ops.segment_sum(jnp.asarray(grid.intervals.length), group, group[-1] + 1)
-    transitions = jnp.broadcast_to(jnp.eye(rates.shape[0]), (len(group), *rates.shape))
+    identity = jnp.broadcast_to(jnp.eye(rates.shape[0]), (len(group), *rates.shape))
     # The chain begins with the first observation.
     starts = np.flatnonzero(is_start)[1:]
-    return transitions.at[starts].set(transition_matrices(rates, dwell[1:])), jnp.asarray(is_start)
+    limit = identity.at[starts].set(transition_matrices(rates + jnp.where(rates == 0, _VANISHING_RATE, 0.0), dwell[1:]))
+    # A regime that cannot be reached has the probability zero, with the derivative of the matrix exponential.
+    is_reachable = jnp.linalg.matrix_power((rates != 0) + jnp.eye(rates.shape[0]), rates.shape[0]) > 0
+    transitions = jnp.where(is_reachable, limit, limit - jax.lax.stop_gradient(limit))
+    return transitions, jax.lax.stop_gradient(limit), jnp.asarray(is_start)
 
 
 def filter_regimes(regimes: RegimeProblem, y: jax.Array) -> RegimeTrace:
@@ -192,7 +216,7 @@ def filter_path(regimes: RegimeProblem, y: jax.Array, path: jax.Array) -> Filter
     """Run the filter given a path (N,) of regimes, as that of a chain that takes this path with certainty."""
     indicators = jax.nn.one_hot(path, len(regimes.problems))
     transitions = jnp.broadcast_to(indicators[:, None], regimes.transitions.shape)
-    certain = regimes._replace(initial=indicators[0], transitions=transitions, memory=0)
+    certain = regimes._replace(initial=indicators[0], transitions=transitions, limit_transitions=transitions, memory=0)
     trace = _forward(certain, y, Record.SMOOTHER)[1]
     initial = _stack([problem.initial() for problem in regimes.problems])
     return jax.vmap(lambda trace, regime: jax.tree.map(lambda a: a[regime, 0], trace))(trace, path)._replace(
@@ -209,17 +233,17 @@ def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[Regi
     updater = GaussianUpdate(y)
     count = len(regimes.problems)
     histories = count**max(regimes.memory - 1, 0)
-    initial = RegimeMoments(
-        jnp.broadcast_to(regimes.initial[:, None] / histories, (count, histories)),
-        jax.tree.map(lambda a: jnp.repeat(a[:, None], histories, axis=1),
-                     _stack([problem.initial() for problem in regimes.problems])))
+    probability = jnp.broadcast_to(regimes.initial[:, None] / histories, (count, histories))
+    moments = jax.tree.map(lambda a: jnp.repeat(a[:, None], histories, axis=1),
+                           _stack([problem.initial() for problem in regimes.problems]))
+    initial = RegimeMoments(probability, moments, _positive(probability, _VANISHING_PROBABILITY))
     updates = [updater.bind(problem, problem.initial()) for problem in regimes.problems]
     rows = with_observations(regimes.grid.intervals, updater.rows())[1]
 
     def step(carry: tuple[RegimeMoments, RegimeMoments], inputs: tuple) -> tuple[tuple, tuple]:
         sources, merged = carry
-        transition, is_start, intervals, row = inputs
-        entering = _enter_regimes(merged, transition, regimes.memory)
+        transitions, is_start, intervals, row = inputs
+        entering = _enter_regimes(merged, *transitions, regimes.memory)
         sources = jax.tree.map(lambda a, b: jnp.where(is_start, a, b), entering, sources)
         traces, distributions = [], []
         for j, (problem, update, interval) in enumerate(zip(regimes.problems, updates, intervals, strict=True)):
@@ -235,30 +259,61 @@ def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[Regi
             distribution = ndtr(updated.innovation / jnp.sqrt((updated.chol**2).sum(-1)))
             distributions.append(sources.probability[j] @ distribution)
         trace = _stack(traces)
-        log_weight = _log(sources.probability) + trace.log_likelihood
-        total = logsumexp(log_weight)
-        weight = jnp.exp(log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
+        total, weight, limit = _update_probabilities(sources, trace.log_likelihood)
+        posterior = RegimeMoments(weight, trace.filtered, limit)
         # The oldest regime is forgotten.
-        joint, sources = jax.tree.map(lambda a: a.reshape(count, histories, -1, *a.shape[2:]), (weight, trace.filtered))
-        filtered = RegimeMoments(joint.sum(2), jax.vmap(jax.vmap(merge))(joint, sources))
+        joint = jax.tree.map(lambda a: a.reshape(count, histories, -1, *a.shape[2:]), posterior)
+        shares = _shares(joint.probability, joint.limit)
+        filtered = RegimeMoments(joint.probability.sum(2), jax.vmap(jax.vmap(merge))(shares, joint.moments),
+                                 joint.limit.sum(2))
         residual = ndtri(jnp.clip(sum(distributions), 1e-15, 1 - 1e-15))
         output = RegimeTrace(total, filtered, jnp.where(jnp.isfinite(row), residual, jnp.nan))
         recorded = None if record is Record.LIKELIHOOD else trace
-        return (RegimeMoments(weight, trace.filtered), filtered), (output, recorded)
+        return (posterior, filtered), (output, recorded)
 
-    carry = _enter_regimes(initial, regimes.transitions[0], regimes.memory), initial
-    inputs = regimes.transitions, regimes.is_start, regimes.intervals, rows
+    transitions = regimes.transitions, regimes.limit_transitions
+    carry = _enter_regimes(initial, *(a[0] for a in transitions), regimes.memory), initial
+    inputs = transitions, regimes.is_start, regimes.intervals, rows
     return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, inputs)[1]
 
 
-def _enter_regimes(filtered: RegimeMoments, transition: jax.Array, memory: int) -> RegimeMoments:
+def _enter_regimes(filtered: RegimeMoments, transition: jax.Array, limit_transition: jax.Array,
+                   memory: int) -> RegimeMoments:
     """Return joint probabilities (K, S) of regimes and their sources after a transition, and the sources' moments."""
-    joint = (transition.T[:, :, None] * filtered.probability).reshape(transition.shape[0], -1)
     sources = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), filtered.moments)
+    joint = (transition.T[:, :, None] * filtered.probability).reshape(len(transition), -1)
+    limit = (limit_transition.T[:, :, None] * filtered.limit).reshape(len(transition), -1)
     if memory:
-        return RegimeMoments(joint, jax.tree.map(lambda a: jnp.broadcast_to(a, (len(joint), *a.shape)), sources))
-    merged = jax.vmap(merge, (0, None))(joint, sources)
-    return RegimeMoments(joint.sum(1, keepdims=True), jax.tree.map(lambda a: a[:, None], merged))
+        entering = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(joint), *a.shape)), sources)
+        return RegimeMoments(joint, entering, limit)
+    merged = jax.vmap(merge, (0, None))(_shares(joint, limit), sources)
+    return RegimeMoments(joint.sum(1, keepdims=True), jax.tree.map(lambda a: a[:, None], merged),
+                         limit.sum(1, keepdims=True))
+
+
+def _shares(probability: jax.Array, limit: jax.Array) -> jax.Array:
+    """Return weights (..., S) of the sources of each regime: the probabilities, or the limit where all are zero."""
+    return jnp.where(probability.sum(-1, keepdims=True) > 0, probability, limit)
+
+
+def _update_probabilities(sources: RegimeMoments, log_likelihood: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the log density of an observation, and the probabilities (K, S) and their limits given it.
+
+    The derivative with respect to a probability of zero is that of the sum of densities.
+    """
+    probability = sources.probability
+    log_weight = jax.lax.stop_gradient(_log(probability) + log_likelihood)
+    largest = jnp.max(log_weight)
+    largest = jnp.where(jnp.isfinite(largest), largest, 0.0)
+    # The density may break down in a regime of probability zero, or exceed the others by any factor.
+    is_used = (probability > 0) | jnp.isfinite(log_likelihood)
+    exponent = jnp.where(is_used, log_likelihood, 0.0) - largest
+    density = jnp.where(is_used, jnp.exp(jnp.minimum(exponent, _LARGEST_EXPONENT)), 0.0)
+    total = (probability * density).sum()
+    share = density / jnp.where(total > 0, total, 1.0)
+    weight = probability * share
+    limit = jnp.minimum(sources.limit * jax.lax.stop_gradient(share), _LARGEST_LIMIT)
+    return largest + _log(total), weight, jnp.where(weight > 0, jax.lax.stop_gradient(weight), limit)
 
 
 def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace, y: jax.Array,
@@ -277,7 +332,7 @@ def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace, y
 
     def step(later: tuple[FutureLikelihood, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
         filtered, keys, transition, intervals, row = inputs
-        joint, sources = _enter_regimes(filtered, transition, 1)
+        joint, sources, _ = _enter_regimes(filtered, transition, transition, 1)
         by_regime = []
         for j, (problem, update, interval) in enumerate(zip(regimes.problems, updates, intervals, strict=True)):
             source = Moments(sources.mean[j], sources.covariance[j])
@@ -331,6 +386,11 @@ def _normalised(log_weight: jax.Array, weights: jax.Array) -> jax.Array:
 def _log(weights: jax.Array) -> jax.Array:
     """Return the logarithm, -inf for zero with a derivative of zero."""
     return jnp.where(weights > 0, jnp.log(jnp.where(weights > 0, weights, 1.0)), -jnp.inf)
+
+
+def _positive(probability: jax.Array, smallest: float) -> jax.Array:
+    """Return ``probability`` without derivative, with ``smallest`` in place of zero."""
+    return jax.lax.stop_gradient(jnp.where(probability > 0, probability, smallest))
 
 
 def _stack(trees: Sequence[Any]) -> Any:
