@@ -45,7 +45,7 @@ from lfm_ppl.switching.regimes import (
     sample_states,
     smooth_path,
 )
-from lfm_ppl.switching.switched_model import SwitchedProblem
+from lfm_ppl.switching.switched_model import SwitchedProblem, with_forces_of
 from lfm_ppl.switching.switched_simulation import simulate_paths
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
@@ -164,8 +164,8 @@ class Switching(SeriesLikelihood):
 
     @property
     def ssms(self) -> tuple[StateSpaceModel, ...]:
-        """The state-space models of the regimes."""
-        return tuple(state_space(model) for model in self.models)
+        """The state-space models of the regimes, with a common state of the forces."""
+        return tuple(state_space(with_forces_of(model, self.models[0])) for model in self.models)
 
     def regimes(self, grid: TimeGrid | None = None) -> RegimeProblem:
         """Return the filter problems of the regimes and the chain on a time grid; None: that of the data."""
