@@ -6,8 +6,8 @@
 4. `sample_path` draws states and regimes given the data; `lfm_ppl.fit` stores such paths.
 5. `sample` simulates the real model by `switching.switched_simulation`, with the chain as its rule.
 
-Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8); Carter and Kohn (1994), Biometrika
-81(3).
+Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8); Lindsten and others (2016), IEEE
+Journal of Selected Topics in Signal Processing 10(2).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.breakdown import FilterWarning
-from lfm_ppl.filtering.intervals import TimeGrid
+from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -45,7 +45,7 @@ from lfm_ppl.switching.regimes import (
     sample_states,
     smooth_path,
 )
-from lfm_ppl.switching.switched_model import SwitchedProblem
+from lfm_ppl.switching.switched_model import SwitchedProblem, with_forces_of
 from lfm_ppl.switching.switched_simulation import simulate_paths
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
@@ -96,6 +96,7 @@ class Switching(SeriesLikelihood):
         initial: (K,), probabilities of the regimes at the first observation; None: equal ones.
         merging: "gpb2", K^2 filters a row; "gpb3" and "gpb4", K^3 and K^4 filters, for regimes whose states stay
             apart; or "imm", K filters, which is faster and merges earlier.
+        method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
 
     Raises:
         ValueError, TypeError: models of other states or outputs; rates or probabilities that are none; and as
@@ -117,22 +118,24 @@ class Switching(SeriesLikelihood):
         (('calm', 'rough'), (5, 2))
 
     Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8), for IMM; Tugnait (1982),
-    Automatica 18(5), for GPBn; Carter and Kohn (1994), Biometrika 81(3), for the draws.
+    Automatica 18(5), for GPBn; Lindsten and others (2016), IEEE Journal of Selected Topics in Signal Processing 10(2),
+    for the draws.
     """
 
     pytree_data_fields = ("models", "rates", "initial")
-    pytree_aux_fields = ("regime_names", "merging", "max_step")
+    pytree_aux_fields = ("regime_names", "merging", "max_step", "method")
 
     def __init__(self, models: Mapping[str, LatentForceModel], rates: ArrayLike, times: ArrayLike,
                  rule: Rule | None = None, steps: int = 10, max_step: float | None = None, *,
-                 initial: ArrayLike | None = None, merging: str = "gpb2") -> None:
+                 initial: ArrayLike | None = None, merging: str = "gpb2", method: str = RUNGE_KUTTA) -> None:
         checks.one_of("merging", merging, MERGINGS)
+        checks.one_of("method", method, METHODS)
         by_name = check_models(models)
         count = len(by_name)
         self.models, self.regime_names = tuple(by_name.values()), tuple(by_name)
         self.rates = check_rates(rates, count)
         self.initial = check_probabilities(jnp.full(count, 1.0 / count) if initial is None else initial, count)
-        self.merging, self.max_step = merging, max_step
+        self.merging, self.max_step, self.method = merging, max_step, method
         super().__init__(joint_model(by_name, self.initial), times, rule, steps)
 
     @property
@@ -143,11 +146,11 @@ class Switching(SeriesLikelihood):
     @property
     def settings(self) -> dict[str, Any]:
         """Arguments besides models, rates and times."""
-        return {name: getattr(self, name) for name in ("rule", "steps", "max_step", "initial", "merging")}
+        return {name: getattr(self, name) for name in ("rule", "steps", "max_step", "initial", "merging", "method")}
 
     def with_settings(self, **settings: Any) -> Switching:
-        """Return the same distribution with another ``rule``, ``steps`` or ``max_step``."""
-        names = ("rule", "steps", "max_step")
+        """Return the same distribution with another ``rule``, ``steps``, ``max_step`` or ``method``."""
+        names = ("rule", "steps", "max_step", "method")
         for name in settings:
             if name not in names:
                 raise ValueError(f"{name} is not a setting of lfm.Switching, whose settings are {', '.join(names)}.")
@@ -161,8 +164,8 @@ class Switching(SeriesLikelihood):
 
     @property
     def ssms(self) -> tuple[StateSpaceModel, ...]:
-        """The state-space models of the regimes."""
-        return tuple(state_space(model) for model in self.models)
+        """The state-space models of the regimes, with a common state of the forces."""
+        return tuple(state_space(with_forces_of(model, self.models[0])) for model in self.models)
 
     def regimes(self, grid: TimeGrid | None = None) -> RegimeProblem:
         """Return the filter problems of the regimes and the chain on a time grid; None: that of the data."""
@@ -223,7 +226,7 @@ class Switching(SeriesLikelihood):
     def _smooth(self, y: jax.Array, grid: TimeGrid) -> RegimeSmootherResult:
         regimes, requested = self.regimes(grid), jnp.asarray(grid.requested)
         trace = filter_regimes(regimes, y)
-        paths, probability = sample_regimes(jax.random.key(0), regimes, trace, SMOOTHER_DRAWS)
+        paths, probability = sample_regimes(jax.random.key(0), regimes, trace, y, SMOOTHER_DRAWS)
 
         def smooth(path: jax.Array) -> Moments:
             # The nodes of the smoother begin with the initial time.
@@ -243,20 +246,21 @@ class Switching(SeriesLikelihood):
         """
         regimes, observed = self.regimes(), jnp.asarray(self.time_grid.observed)
         trace = filter_regimes(regimes, y)
-        path = sample_regimes(key, regimes, trace, 1)[0][:, 0]
+        path = sample_regimes(key, regimes, trace, y, 1)[0][:, 0]
         left_out = smooth_path(regimes, y, path).leave_one_out
         return {"leave_one_out": left_out[observed], "one_step_ahead": trace.log_likelihood[observed],
                 "residual": trace.residual[observed]}
 
     def _grid(self, at: Any, steps: int | None = None) -> TimeGrid:
-        return build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at)
+        steps = self.steps if steps is None else steps
+        return build_time_grid(self.ssm, self.times, steps, self.max_step, at)._replace(method=self.method)
 
     def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
         """Draw a trajectory given the data, whose state is (x, indicators of the regimes); see the base class."""
         grid = self.time_grid if at is None else self._grid(at)
         regimes, requested = self.regimes(grid), jnp.asarray(grid.requested)
         path_key, state_key = jax.random.split(key)
-        path = sample_regimes(path_key, regimes, filter_regimes(regimes, y), 1)[0][:, 0]
+        path = sample_regimes(path_key, regimes, filter_regimes(regimes, y), y, 1)[0][:, 0]
         states = sample_states(state_key, regimes, y, path)[requested]
         indices, times = path[requested], jnp.asarray(grid.requested_times, float)
         candidates = jnp.stack([jax.vmap(ssm.inputs)(states, times) for ssm in self.ssms])

@@ -9,18 +9,22 @@ it (GPBn; GPB2 and IMM have one history, so that a source is a regime). For each
    by their moments, too, with the weights c_ij / sum_i c_ij, and takes K filters.
 3. The one-step-ahead density is the mixture sum_ij c_ij N(y_k; mu_ij, S_ij), whose terms are the new weights.
 
-From the last interval to the first, for each of S draws of the later state s_k+1 and its regime j,
+From the last interval to the first, for each of S draws of the later regimes r_k+1, r_k+2, ...,
 
-4. p(i | s_k+1, j, y) is proportional to c_ij N(s_k+1; m_ij, P_ij), with the predictions (i, j) from the merged states,
-   and the smoother's gain gives the Gaussian of s_k given i. Both are drawn from this law, which is exact given the
-   merged states. After the last observation the chain is simulated.
+4. the density of the later observations given the later regimes is Gaussian in s_k, with the state integrated out
+   (`FutureLikelihood`). p(i | r_k+1, ..., y) is proportional to c_ij N(y_k+1; mu_ij, S_ij) times the integral of that
+   density over the filtered state of (i, j), with the predictions (i, j) from the merged states. The regime is drawn
+   from this law, which is exact given the merged states: only the past is merged. No state is drawn before the path,
+   since a later state pins an earlier one where there is no process noise, and the merged Gaussian does not hold there.
+   After the last observation the chain is simulated.
 5. Given a path of regimes the model is that of one filter: its trace goes to the backward scan of the smoother, and
    draws of the state are exact.
 
 The index of a source is ``regime * M + history``, and that of a history has the oldest regime last.
 
 Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8), for IMM; Tugnait (1982), Automatica
-18(5), for GPBn; Carter and Kohn (1994), Biometrika 81(3), for the draws.
+18(5), for GPBn; Lindsten, Bunch, Sarkka, Schon and Godsill (2016), IEEE Journal of Selected Topics in Signal Processing
+10(2), for the draws.
 """
 
 from __future__ import annotations
@@ -32,27 +36,31 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import logsumexp, ndtr, ndtri
+from jax.scipy.special import ndtr, ndtri
 
 from lfm_ppl.filtering.backward import SmootherTrace, backward
 from lfm_ppl.filtering.forward import FilterTrace, predict, update_at_end
 from lfm_ppl.filtering.intervals import TimeGrid, as_arrays, with_observations
-from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.moments import Moments, Prediction, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem
 from lfm_ppl.filtering.sample import sample_errors
-from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
-from lfm_ppl.filtering.update import GaussianUpdate
+from lfm_ppl.filtering.update import GaussianUpdate, Update
 from lfm_ppl.switching.chain import transition_matrices
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gaussian_residuals import log_density
-from lfm_ppl.utils.linalg import cholesky, diagonal, semidefinite_root, solve_lower
+from lfm_ppl.utils.linalg import cholesky, congruence, matmul, solve_lower
 
 MERGINGS = {"imm": 0, "gpb2": 1, "gpb3": 2, "gpb4": 3}
 """Methods of merging -> number of latest regimes for whose histories there are states; 0: merged before the prediction.
 """
 
-_JITTER = 1e-10
-"""Relative variance added to a predicted covariance whose density is compared between regimes: it may be singular."""
+_VANISHING_RATE, _VANISHING_PROBABILITY = 1e-60, 1e-120
+"""A rate and an initial probability in place of zero. With them a regime of probability zero has a state, the limit for
+rates that tend to zero, on which the derivative with respect to a rate of zero depends."""
+
+_LARGEST_EXPONENT, _LARGEST_LIMIT = 700.0, 1e200
+"""Bounds of the density and the limit of a regime of probability zero, which overflow in data that contradict the
+others."""
 
 
 class RegimeProblem(NamedTuple):
@@ -62,6 +70,7 @@ class RegimeProblem(NamedTuple):
         problems: of the K regimes.
         initial: (K,), probabilities of the regimes at the first observation.
         transitions: (N, K, K), probabilities p(r_k = j | r_k-1 = i) at the starts of the intervals.
+        limit_transitions: (N, K, K), the same with `_VANISHING_RATE` in place of rates of zero.
         is_start: (N,), whether an interval is the first after an observation, so that the regime may change.
         memory: one of the values of `MERGINGS`.
     """
@@ -69,6 +78,7 @@ class RegimeProblem(NamedTuple):
     problems: tuple[FilterProblem, ...]
     initial: jax.Array
     transitions: jax.Array
+    limit_transitions: jax.Array
     is_start: jax.Array
     memory: int
 
@@ -84,10 +94,17 @@ class RegimeProblem(NamedTuple):
 
 
 class RegimeMoments(NamedTuple):
-    """Probabilities (..., K, M) of the K regimes and M histories before each, and moments of the state given them."""
+    """Probabilities of the K regimes and M histories before each, and moments of the state given them.
+
+    Attributes:
+        probability: (..., K, M).
+        moments: (..., K, M).
+        limit: (..., K, M), ``probability`` with `_VANISHING_RATE` in place of rates of zero, without derivative.
+    """
 
     probability: jax.Array
     moments: Moments
+    limit: jax.Array
 
 
 class RegimeTrace(NamedTuple):
@@ -104,8 +121,56 @@ class RegimeTrace(NamedTuple):
     residual: jax.Array
 
 
+class FutureLikelihood(NamedTuple):
+    """The density of all later observations given the state s and the later regimes, up to a factor.
+
+    It is that of n observations with unit noise, exp(-|value - jacobian (s - point)|^2 / 2), in the square-root form of
+    the information filter: neither the process noise nor the state's covariance is inverted, so that both may be zero.
+
+    Attributes:
+        value: (n,).
+        jacobian: (n, n).
+        point: (n,).
+    """
+
+    value: jax.Array
+    jacobian: jax.Array
+    point: jax.Array
+
+    def log_density(self, mean: jax.Array, covariance: jax.Array) -> jax.Array:
+        """Return the log density of the later observations given that s ~ N(mean, covariance)."""
+        residual = self.value - matvec(self.jacobian, mean - self.point)
+        chol = cholesky(jnp.eye(len(mean)) + congruence(self.jacobian, covariance)).chol
+        return log_density(solve_lower(chol, residual), chol)
+
+    def with_observation(self, predicted_mean: jax.Array, update: Update) -> FutureLikelihood:
+        """Return the density with the observation of ``update`` among the later ones."""
+        # An observation without noise gets one that is lost in the rounding of its innovation covariance.
+        rounding = jnp.finfo(update.chol.dtype).eps * (update.chol**2).sum(-1)
+        chol = cholesky(update.obs_cov + jnp.diag(rounding)).chol
+        residual = self.value - matvec(self.jacobian, predicted_mean - self.point)
+        rows = jnp.block([[self.jacobian, residual[:, None]],
+                          [solve_lower(chol, update.jacobian), solve_lower(chol, update.innovation)[:, None]]])
+        # A rotation leaves the sum of squares; the last row has no coefficients of s.
+        reduced = jnp.linalg.qr(rows, mode="r")[:len(residual)]
+        return FutureLikelihood(reduced[:, -1], reduced[:, :-1], predicted_mean)
+
+    def at_start(self, mean: jax.Array, prediction: Prediction) -> FutureLikelihood:
+        """Return the density as a function of the state at the start of an interval.
+
+        Args:
+            mean: of the state at the start, whose prediction has the mean ``point``.
+            prediction: over the interval.
+        """
+        chol = cholesky(jnp.eye(len(mean)) + congruence(self.jacobian, prediction.process_cov)).chol
+        jacobian = solve_lower(chol, matmul(self.jacobian, prediction.phi))
+        return FutureLikelihood(solve_lower(chol, self.value), jacobian, mean)
+
+
 def merge(weights: jax.Array, moments: Moments) -> Moments:
     """Return the moments of a mixture; ``weights`` (S,) need not be normalised, and zeros alone count as equal."""
+    largest = jax.lax.stop_gradient(weights.max())
+    weights = weights / jnp.where(largest > 0, largest, 1.0)  # the derivative of a share has the square of their sum
     total = weights.sum()
     share = jnp.where(total > 0, weights / jnp.where(total > 0, total, 1.0), 1.0 / weights.shape[0])
     mean = share @ moments.mean
@@ -114,8 +179,8 @@ def merge(weights: jax.Array, moments: Moments) -> Moments:
     return Moments(mean, covariance)
 
 
-def regime_transitions(rates: jax.Array, grid: TimeGrid) -> tuple[jax.Array, jax.Array]:
-    """Return the fields ``transitions`` and ``is_start`` of a `RegimeProblem`.
+def regime_transitions(rates: jax.Array, grid: TimeGrid) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the fields ``transitions``, ``limit_transitions`` and ``is_start`` of a `RegimeProblem`.
 
     The regime is constant between two observations: the first interval after an observation carries the transition over
     the whole time to the next, other intervals the identity. After the last observation each interval is a transition.
@@ -132,10 +197,14 @@ def regime_transitions(rates: jax.Array, grid: TimeGrid) -> tuple[jax.Array, jax
     is_start = np.append(True, is_end[:-1])
     group = np.cumsum(is_start) - 1
     dwell = jax.ops.segment_sum(jnp.asarray(grid.intervals.length), group, group[-1] + 1)
-    transitions = jnp.broadcast_to(jnp.eye(rates.shape[0]), (len(group), *rates.shape))
+    identity = jnp.broadcast_to(jnp.eye(rates.shape[0]), (len(group), *rates.shape))
     # The chain begins with the first observation.
     starts = np.flatnonzero(is_start)[1:]
-    return transitions.at[starts].set(transition_matrices(rates, dwell[1:])), jnp.asarray(is_start)
+    limit = identity.at[starts].set(transition_matrices(rates + jnp.where(rates == 0, _VANISHING_RATE, 0.0), dwell[1:]))
+    # A regime that cannot be reached has the probability zero, with the derivative of the matrix exponential.
+    is_reachable = jnp.linalg.matrix_power((rates != 0) + jnp.eye(rates.shape[0]), rates.shape[0]) > 0
+    transitions = jnp.where(is_reachable, limit, limit - jax.lax.stop_gradient(limit))
+    return transitions, jax.lax.stop_gradient(limit), jnp.asarray(is_start)
 
 
 def filter_regimes(regimes: RegimeProblem, y: jax.Array) -> RegimeTrace:
@@ -147,7 +216,7 @@ def filter_path(regimes: RegimeProblem, y: jax.Array, path: jax.Array) -> Filter
     """Run the filter given a path (N,) of regimes, as that of a chain that takes this path with certainty."""
     indicators = jax.nn.one_hot(path, len(regimes.problems))
     transitions = jnp.broadcast_to(indicators[:, None], regimes.transitions.shape)
-    certain = regimes._replace(initial=indicators[0], transitions=transitions, memory=0)
+    certain = regimes._replace(initial=indicators[0], transitions=transitions, limit_transitions=transitions, memory=0)
     trace = _forward(certain, y, Record.SMOOTHER)[1]
     initial = _stack([problem.initial() for problem in regimes.problems])
     return jax.vmap(lambda trace, regime: jax.tree.map(lambda a: a[regime, 0], trace))(trace, path)._replace(
@@ -164,17 +233,17 @@ def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[Regi
     updater = GaussianUpdate(y)
     count = len(regimes.problems)
     histories = count**max(regimes.memory - 1, 0)
-    initial = RegimeMoments(
-        jnp.broadcast_to(regimes.initial[:, None] / histories, (count, histories)),
-        jax.tree.map(lambda a: jnp.repeat(a[:, None], histories, axis=1),
-                     _stack([problem.initial() for problem in regimes.problems])))
+    probability = jnp.broadcast_to(regimes.initial[:, None] / histories, (count, histories))
+    moments = jax.tree.map(lambda a: jnp.repeat(a[:, None], histories, axis=1),
+                           _stack([problem.initial() for problem in regimes.problems]))
+    initial = RegimeMoments(probability, moments, _positive(probability, _VANISHING_PROBABILITY))
     updates = [updater.bind(problem, problem.initial()) for problem in regimes.problems]
     rows = with_observations(regimes.grid.intervals, updater.rows())[1]
 
     def step(carry: tuple[RegimeMoments, RegimeMoments], inputs: tuple) -> tuple[tuple, tuple]:
         sources, merged = carry
-        transition, is_start, intervals, row = inputs
-        entering = _enter_regimes(merged, transition, regimes.memory)
+        transitions, is_start, intervals, row = inputs
+        entering = _enter_regimes(merged, *transitions, regimes.memory)
         sources = jax.tree.map(lambda a, b: jnp.where(is_start, a, b), entering, sources)
         traces, distributions = [], []
         for j, (problem, update, interval) in enumerate(zip(regimes.problems, updates, intervals, strict=True)):
@@ -190,84 +259,112 @@ def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[Regi
             distribution = ndtr(updated.innovation / jnp.sqrt((updated.chol**2).sum(-1)))
             distributions.append(sources.probability[j] @ distribution)
         trace = _stack(traces)
-        log_weight = _log(sources.probability) + trace.log_likelihood
-        total = logsumexp(log_weight)
-        weight = jnp.exp(log_weight - jnp.where(jnp.isfinite(total), total, 0.0))
+        total, weight, limit = _update_probabilities(sources, trace.log_likelihood)
+        posterior = RegimeMoments(weight, trace.filtered, limit)
         # The oldest regime is forgotten.
-        joint, sources = jax.tree.map(lambda a: a.reshape(count, histories, -1, *a.shape[2:]), (weight, trace.filtered))
-        filtered = RegimeMoments(joint.sum(2), jax.vmap(jax.vmap(merge))(joint, sources))
+        joint = jax.tree.map(lambda a: a.reshape(count, histories, -1, *a.shape[2:]), posterior)
+        shares = _shares(joint.probability, joint.limit)
+        filtered = RegimeMoments(joint.probability.sum(2), jax.vmap(jax.vmap(merge))(shares, joint.moments),
+                                 joint.limit.sum(2))
         residual = ndtri(jnp.clip(sum(distributions), 1e-15, 1 - 1e-15))
         output = RegimeTrace(total, filtered, jnp.where(jnp.isfinite(row), residual, jnp.nan))
         recorded = None if record is Record.LIKELIHOOD else trace
-        return (RegimeMoments(weight, trace.filtered), filtered), (output, recorded)
+        return (posterior, filtered), (output, recorded)
 
-    carry = _enter_regimes(initial, regimes.transitions[0], regimes.memory), initial
-    inputs = regimes.transitions, regimes.is_start, regimes.intervals, rows
+    transitions = regimes.transitions, regimes.limit_transitions
+    carry = _enter_regimes(initial, *(a[0] for a in transitions), regimes.memory), initial
+    inputs = transitions, regimes.is_start, regimes.intervals, rows
     return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, inputs)[1]
 
 
-def _enter_regimes(filtered: RegimeMoments, transition: jax.Array, memory: int) -> RegimeMoments:
+def _enter_regimes(filtered: RegimeMoments, transition: jax.Array, limit_transition: jax.Array,
+                   memory: int) -> RegimeMoments:
     """Return joint probabilities (K, S) of regimes and their sources after a transition, and the sources' moments."""
-    joint = (transition.T[:, :, None] * filtered.probability).reshape(transition.shape[0], -1)
     sources = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), filtered.moments)
+    joint = (transition.T[:, :, None] * filtered.probability).reshape(len(transition), -1)
+    limit = (limit_transition.T[:, :, None] * filtered.limit).reshape(len(transition), -1)
     if memory:
-        return RegimeMoments(joint, jax.tree.map(lambda a: jnp.broadcast_to(a, (len(joint), *a.shape)), sources))
-    merged = jax.vmap(merge, (0, None))(joint, sources)
-    return RegimeMoments(joint.sum(1, keepdims=True), jax.tree.map(lambda a: a[:, None], merged))
+        entering = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(joint), *a.shape)), sources)
+        return RegimeMoments(joint, entering, limit)
+    merged = jax.vmap(merge, (0, None))(_shares(joint, limit), sources)
+    return RegimeMoments(joint.sum(1, keepdims=True), jax.tree.map(lambda a: a[:, None], merged),
+                         limit.sum(1, keepdims=True))
 
 
-def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace,
+def _shares(probability: jax.Array, limit: jax.Array) -> jax.Array:
+    """Return weights (..., S) of the sources of each regime: the probabilities, or the limit where all are zero."""
+    return jnp.where(probability.sum(-1, keepdims=True) > 0, probability, limit)
+
+
+def _update_probabilities(sources: RegimeMoments, log_likelihood: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return the log density of an observation, and the probabilities (K, S) and their limits given it.
+
+    The derivative with respect to a probability of zero is that of the sum of densities.
+    """
+    probability = sources.probability
+    log_weight = jax.lax.stop_gradient(_log(probability) + log_likelihood)
+    largest = jnp.max(log_weight)
+    largest = jnp.where(jnp.isfinite(largest), largest, 0.0)
+    # The density may break down in a regime of probability zero, or exceed the others by any factor.
+    is_used = (probability > 0) | jnp.isfinite(log_likelihood)
+    exponent = jnp.where(is_used, log_likelihood, 0.0) - largest
+    density = jnp.where(is_used, jnp.exp(jnp.minimum(exponent, _LARGEST_EXPONENT)), 0.0)
+    total = (probability * density).sum()
+    share = density / jnp.where(total > 0, total, 1.0)
+    weight = probability * share
+    limit = jnp.minimum(sources.limit * jax.lax.stop_gradient(share), _LARGEST_LIMIT)
+    return largest + _log(total), weight, jnp.where(weight > 0, jax.lax.stop_gradient(weight), limit)
+
+
+def sample_regimes(key: jax.Array, regimes: RegimeProblem, trace: RegimeTrace, y: jax.Array,
                    draws: int) -> tuple[jax.Array, jax.Array]:
-    """Draw paths of regimes given the observations.
+    """Draw paths of regimes given the observations (T, D), with the state integrated out.
 
     Returns:
         The paths (N, S) and the probabilities (N, K) of the regimes, at the ends of the intervals.
     """
     filtered, last = trace.filtered, max(regimes.grid.observed)
-    histories = filtered.probability.shape[2]
+    histories, size = filtered.probability.shape[2], filtered.moments.mean.shape[-1]
+    updater = GaussianUpdate(y)
+    updates = [updater.bind(problem, problem.initial()) for problem in regimes.problems]
+    rows = with_observations(regimes.grid.intervals, updater.rows())[1]
     keys = jax.random.split(key, (len(trace.log_likelihood), draws))
 
-    def step(later: tuple[jax.Array, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
-        filtered, keys, transition, intervals = inputs
-        joint, sources = _enter_regimes(filtered, transition, 1)
-        sources = jax.tree.map(lambda a: a[0], sources)  # they are the same for all regimes
-        predictions = []
-        for problem, interval in zip(regimes.problems, intervals, strict=True):
-            predicted = jax.vmap(functools.partial(predict, problem, interval, record=Record.SMOOTHER))(sources)
-            kernel = jax.vmap(smoothing_kernel)(sources, predicted.moments, predicted.phi, predicted.process_cov)
-            predictions.append((predicted.moments, kernel.gain, jax.vmap(semidefinite_root)(kernel.conditional)))
-        by_regime = joint, _stack(predictions)
+    def step(later: tuple[FutureLikelihood, jax.Array], inputs: tuple) -> tuple[tuple, tuple]:
+        filtered, keys, transition, intervals, row = inputs
+        joint, sources, _ = _enter_regimes(filtered, transition, transition, 1)
+        by_regime = []
+        for j, (problem, update, interval) in enumerate(zip(regimes.problems, updates, intervals, strict=True)):
+            source = Moments(sources.mean[j], sources.covariance[j])
+            prediction = jax.vmap(functools.partial(predict, problem, interval, record=Record.SMOOTHER))(source)
+            updated = jax.vmap(functools.partial(update_at_end, problem, update, interval, row))(prediction.moments)
+            by_regime.append((joint[j], source, prediction, updated))
+        stacked = _stack(by_regime)
 
-        def draw(key: jax.Array, state: jax.Array, regime: jax.Array) -> tuple[tuple, jax.Array]:
-            weights, (predicted, gain, root) = jax.tree.map(lambda a: a[regime], by_regime)
-            probability = _source_probabilities(weights, predicted, state)
-            source_key, state_key = jax.random.split(key)
-            source = jax.random.categorical(source_key, _log(probability))
-            mean = sources.mean[source] + gain[source] @ (state - predicted.mean[source])
-            state = mean + root[source] @ jax.random.normal(state_key, mean.shape)
-            return (state, source // histories), probability.reshape(-1, histories).sum(1)
+        def draw(key: jax.Array, future: FutureLikelihood, regime: jax.Array) -> tuple[tuple, jax.Array]:
+            weights, source, prediction, updated = jax.tree.map(lambda a: a[regime], stacked)
+            log_weight = _log(weights) + updated.log_likelihood + jax.vmap(future.log_density)(*updated.moments)
+            probability = _normalised(log_weight, weights)
+            index = jax.random.categorical(key, _log(probability))
+            source, prediction, updated = jax.tree.map(lambda a: a[index], (source, prediction, updated))
+            future = future.with_observation(prediction.moments.mean, updated).at_start(source.mean, prediction)
+            return (future, index // histories), probability.reshape(-1, histories).sum(1)
 
         earlier, probability = jax.vmap(draw)(keys, *later)
         return earlier, (earlier[1], probability.mean(0))
-
-    def draw_last(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        source_key, state_key = jax.random.split(key)
-        probability, moments = jax.tree.map(lambda a: a[last].reshape(-1, *a.shape[3:]), filtered)
-        source = jax.random.categorical(source_key, _log(probability))
-        normal = jax.random.normal(state_key, moments.mean[source].shape)
-        return moments.mean[source] + semidefinite_root(moments.covariance[source]) @ normal, source // histories
 
     def simulate(regime: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         transition, keys = inputs
         regime = jax.vmap(jax.random.categorical)(keys, _log(transition[regime]))
         return regime, regime
 
-    end = jax.vmap(draw_last)(keys[last])
+    end = jax.vmap(jax.random.categorical, (0, None))(keys[last], _log(filtered.probability[last].sum(1)))
+    nothing = FutureLikelihood(jnp.zeros((draws, size)), jnp.zeros((draws, size, size)), jnp.zeros((draws, size)))
     inputs = (*jax.tree.map(lambda a: a[:last], (filtered, keys)),
-              *jax.tree.map(lambda a: a[1:last + 1], (regimes.transitions, regimes.intervals)))
-    earlier, probability = jax.lax.scan(step, end, inputs, reverse=True)[1]
-    later = jax.lax.scan(simulate, end[1], (regimes.transitions[last + 1:], keys[last + 1:]))[1]
-    return (jnp.concatenate([earlier, end[1][None], later]),
+              *jax.tree.map(lambda a: a[1:last + 1], (regimes.transitions, regimes.intervals, rows)))
+    earlier, probability = jax.lax.scan(step, (nothing, end), inputs, reverse=True)[1]
+    later = jax.lax.scan(simulate, end, (regimes.transitions[last + 1:], keys[last + 1:]))[1]
+    return (jnp.concatenate([earlier, end[None], later]),
             jnp.concatenate([probability, filtered.probability[last:].sum(2)]))
 
 
@@ -278,17 +375,8 @@ def sample_states(key: jax.Array, regimes: RegimeProblem, y: jax.Array, path: ja
     return smoothed + sample_errors(key, trace, 1)[:, :, 0]
 
 
-def _source_probabilities(weights: jax.Array, predicted: Moments, state: jax.Array) -> jax.Array:
-    """Return the probabilities (K M,) of the sources from which the later ``state`` (n,) came."""
-
-    def density(mean: jax.Array, covariance: jax.Array) -> jax.Array:
-        # A known coordinate gets a width far below its size and above its rounding errors.
-        sd = jnp.sqrt(diagonal(covariance)) + 1e-8 * jnp.abs(state) + 1e-150
-        scaled = covariance / (sd[:, None] * sd) + _JITTER * jnp.eye(sd.shape[0])
-        chol = cholesky(scaled).chol
-        return log_density(solve_lower(chol, (state - mean) / sd), chol) - jnp.log(sd).sum()
-
-    log_weight = _log(weights) + jax.vmap(density)(*predicted)
+def _normalised(log_weight: jax.Array, weights: jax.Array) -> jax.Array:
+    """Return the probabilities (K M,) of the sources; those before the data, where the data are impossible."""
     log_weight = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
     is_possible = jnp.isfinite(log_weight).any()
     return jnp.where(is_possible, jax.nn.softmax(jnp.where(is_possible, log_weight, 0.0)),
@@ -298,6 +386,11 @@ def _source_probabilities(weights: jax.Array, predicted: Moments, state: jax.Arr
 def _log(weights: jax.Array) -> jax.Array:
     """Return the logarithm, -inf for zero with a derivative of zero."""
     return jnp.where(weights > 0, jnp.log(jnp.where(weights > 0, weights, 1.0)), -jnp.inf)
+
+
+def _positive(probability: jax.Array, smallest: float) -> jax.Array:
+    """Return ``probability`` without derivative, with ``smallest`` in place of zero."""
+    return jax.lax.stop_gradient(jnp.where(probability > 0, probability, smallest))
 
 
 def _stack(trees: Sequence[Any]) -> Any:

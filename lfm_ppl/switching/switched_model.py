@@ -25,6 +25,7 @@ from lfm_ppl.filtering.intervals import Intervals, TimeGrid
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.forces.shared_state import in_state_of, structure_of
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import require_gaussian
@@ -86,7 +87,8 @@ def build_models(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ..
     """
     if not isinstance(rule, SwitchingRule):
         raise TypeError(f"rule must be an lfm.SwitchingRule such as lfm.Thermostat(20.0), got {type(rule).__name__}.")
-    ssms = tuple(state_space(build(value)) for value in rule.values)
+    models = [build(value) for value in rule.values]
+    ssms = tuple(state_space(model) for model in models)
     check_structure({f"build({value:g})": ssm for value, ssm in zip(rule.values, ssms, strict=True)})
     starts = [[checks.concrete(entry) for entry in (*ssm.initial(), ssm.model.initial_time)] for ssm in ssms]
     for value, start in zip(rule.values, starts, strict=True):
@@ -94,14 +96,14 @@ def build_models(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ..
         if any(a is not None and b is not None and not np.array_equal(a, b) for a, b in pairs):
             raise ValueError(f"build({value:g}) has another initial state or time than build({rule.values[0]:g}); the "
                              "input acts from the initial time on, so both models must start alike.")
-    return ssms
+    return tuple(state_space(with_forces_of(model, models[0])) for model in models)
 
 
 def check_structure(ssms: Mapping[str, StateSpaceModel]) -> None:
     """Raise ValueError unless the models, by their names in messages, differ in coefficients only."""
     first, *_ = names = list(ssms)
     structures = [{"states": ssm.model.state_names, "forces": ssm.model.force_names,
-                   "types of forces": [type(force).__name__ for force in ssm.model.force_list],
+                   "types of forces": [structure_of(force) for force in ssm.model.force_list],
                    "outputs": ssm.model.output_names, "deterministics": ssm.model.deterministic_names,
                    "angular outputs": ssm.model.observation.angular, "a joint state of size": ssm.state_dim,
                    "jump times": ssm.stack.jump_times} for ssm in ssms.values()]
@@ -112,6 +114,14 @@ def check_structure(ssms: Mapping[str, StateSpaceModel]) -> None:
             if value != structures[0][kind]:
                 raise ValueError(f"{name} has {kind} {value}, and {first} has {structures[0][kind]}; models between "
                                  "which the system switches may differ in coefficients only.")
+
+
+def with_forces_of(model: LatentForceModel, reference: LatentForceModel) -> LatentForceModel:
+    """Return the model with forces in the state of the reference's, so that a switch keeps their derivatives."""
+    if model is reference:
+        return model
+    forces = {name: in_state_of(force, reference.forces[name]) for name, force in model.forces.items()}
+    return eqx.tree_at(lambda model: model.forces, model, forces)
 
 
 def decision_grid(ssm: StateSpaceModel, times: Any, decisions: Any, start: FilterState | None, steps: int,

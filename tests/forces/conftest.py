@@ -15,6 +15,7 @@ from lfm_ppl.forces import (  # isort: skip
     CQM, SQM, WQM, Constant, Force, Matern, ModeratedPeriodicMatern, Periodic, PeriodicMatern,
     PeriodicSquaredExponential, QuasiPeriodic, RandomWalk, Resonator, SparseSpectrum, SquaredExponential,
     WienerVelocity)
+from lfm_ppl.forces.shared_state import in_state_of
 
 # Functions of (scale, lengthscale). A new force is covered by a line here.
 FORCES = {
@@ -41,10 +42,13 @@ FORCES = {
         PeriodicSquaredExponential(s, 1.2, 9.0 * ell), SQM(2.0, (1.0, 3.0)), functions=3, explained_variance=0.0),
     "oscillator": lambda s, ell: Oscillator(s, ell),
     "jumping_sum": lambda s, ell: Oscillator(s, ell, (1.0, 3.0)) + Matern(s, ell),
+    "shared_matern": lambda s, ell: in_state_of(Matern(s, ell, 2), Matern(1.0, 0.3 * ell, 2)),
+    "shared_squared_exponential": lambda s, ell: in_state_of(
+        SquaredExponential(s, ell, order=4), SquaredExponential(1.0, 2.0 * ell, order=4)),
 }
 # Forces whose state-space form has exactly the covariance that they state in closed form.
 EXACT = [name for name in FORCES if not name.startswith(
-    ("squared", "oscillator", "jumping", "quasi")) and name not in ("periodic", "periodic_moderated")]
+    ("squared", "oscillator", "jumping", "quasi", "shared_squared")) and name not in ("periodic", "periodic_moderated")]
 # Compiled by default, at least one of each kind; the others with -m slow.
 QUICK = ("matern_1", "matern_5", "squared_exponential_6", "wiener_velocity", "random_walk", "damped_resonator",
          "sparse_spectrum", "constant", "sum", "cqm", "sqm", "wqm", "periodic", "quasi_periodic_steps", "jumping_sum")

@@ -132,7 +132,7 @@ def test_draws_have_the_smoothing_distribution():
     y = np.asarray(switching.sample(jax.random.key(1)))
     exact, regimes = enumerate_paths(switching, y), switching.regimes()
     trace = filter_regimes(regimes, jnp.asarray(y))
-    paths, probability = jax.jit(lambda key: sample_regimes(key, regimes, trace, 4000))(jax.random.key(0))
+    paths, probability = jax.jit(lambda key: sample_regimes(key, regimes, trace, jnp.asarray(y), 4000))(jax.random.key(0))
     # Three standard errors of a probability are .024; merging adds less.
     np.testing.assert_allclose((paths == 1).mean(1), exact.probability[:, 1], atol=0.03)
     np.testing.assert_allclose(probability, exact.probability, atol=0.02)
