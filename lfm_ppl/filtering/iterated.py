@@ -29,9 +29,14 @@ from lfm_ppl.filtering.backward import SmootherTrace, backward
 from lfm_ppl.filtering.dynamics import columns, linearization_indices
 from lfm_ppl.filtering.forward import FilterTrace, LinearizationPoints, NodeRecord, forward
 from lfm_ppl.filtering.moments import Moments, Record, matvec
-from lfm_ppl.filtering.problem import FilterProblem, is_observation_nonlinear
+from lfm_ppl.filtering.problem import FilterProblem, is_affine, is_observation_nonlinear
 from lfm_ppl.filtering.update import Updater
+from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils.linalg import congruence, safe_sqrt
+
+DEFAULT_ITERATIONS = 3
+"""Iterations of posterior linearisation of models that are not linear."""
 
 _NEGLIGIBLE_STEP = 1e-8
 """Square of a step, in standard deviations, below which the secant method has no information."""
@@ -63,6 +68,17 @@ class _Iterate(NamedTuple):
     step: jax.Array
     fraction: jax.Array
     change: jax.Array
+
+
+def number_of_iterations(iterations: int | None, ssm: StateSpaceModel, tolerance: float | None) -> int:
+    """Return the number of iterations of the smoother and of the likelihood, the default for None.
+
+    A linear model, an observation family and steps that follow a tolerance take none by default.
+    """
+    if iterations is not None:
+        return iterations
+    is_family = isinstance(ssm.model.observation, ObservationFamily)
+    return 0 if is_family or tolerance is not None or is_affine(ssm) else DEFAULT_ITERATIONS
 
 
 def posterior_linearisation(problem: FilterProblem, updater: Updater, iterations: int,

@@ -28,7 +28,7 @@ from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.filter import whitened_innovations
 from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid
-from lfm_ppl.filtering.iterated import posterior_linearisation
+from lfm_ppl.filtering.iterated import number_of_iterations, posterior_linearisation
 from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
 from lfm_ppl.filtering.sample import sample_errors
@@ -157,8 +157,8 @@ def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
 
 
 def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule | None = None, steps: int = 10,
-           max_step: float | None = None, at: ArrayLike | None = None, iterations: int = 0, damping: float = 0.7,
-           tolerance: float | None = None, sites: SiteSettings | str | None = None,
+           max_step: float | None = None, at: ArrayLike | None = None, iterations: int | None = None,
+           damping: float = 0.7, tolerance: float | None = None, sites: SiteSettings | str | None = None,
            method: str = RUNGE_KUTTA) -> SmootherResult:
     """Smooth: the state and the forces given all observations.
 
@@ -175,7 +175,8 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         at: (K,) times at which results are wanted, in any order, also after the last observation (a forecast).
             The observation times by default. They end intervals of the scan, so that results elsewhere change by the
             error of the integration steps.
-        iterations: of posterior linearisation, 0 for none.
+        iterations: of posterior linearisation; 0 for none. The default is that of `lfm_ppl.MarginalLikelihood`, 3 for
+            a model that is not linear, so that both compute the same log likelihood.
         damping: largest fraction of each new iterate that is taken, in (0, 1]; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
         method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
@@ -205,8 +206,9 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     rule = as_rule(rule)
     checks.one_of("method", method, METHODS)
     check_iterations(iterations, damping, tolerance)
-    settings = as_settings(sites, iterations)
     ssm = state_space(model)
+    iterations = number_of_iterations(iterations, ssm, tolerance)
+    settings = as_settings(sites, iterations)
     grid = build_time_grid(ssm, times, steps, max_step, at, tolerance=tolerance)._replace(method=method)
     model.check_at(grid.initial_time, np.shape(times)[0])
     check_resolution(model, times, y)

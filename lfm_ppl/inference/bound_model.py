@@ -392,6 +392,8 @@ class BoundModel:
     def filter(self, z: ArrayLike | Mapping[str, Any], y: ArrayLike | None = None) -> FilterResult:
         """Return the result of the Gaussian filter at parameters z (d,), or site name -> value; see `lfm_ppl.filter`.
 
+        It is a single pass, also where `log_density` iterates posterior linearisation.
+
         Raises:
             ValueError: the model is a panel, whose series are filtered one by one.
         """

@@ -25,6 +25,7 @@ from lfm_ppl.filtering.ep.evidence import Evidence, evidence
 from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA
+from lfm_ppl.filtering.iterated import number_of_iterations
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
@@ -37,9 +38,6 @@ from lfm_ppl.utils.gradients import finite_or_minus_infinity
 
 SIMULATION_STEPS = 5
 """Steps of the simulator for one integration step of the filter: its paths are rougher than moments."""
-
-DEFAULT_ITERATIONS = 3
-"""Iterations of posterior linearisation of models that are not linear."""
 
 
 class MarginalLikelihood(SeriesLikelihood):
@@ -130,7 +128,7 @@ class MarginalLikelihood(SeriesLikelihood):
                  constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (),
                  grid: ArrayLike | int | None = None, draws: int = 256, validate_args: bool | None = None):
         _check_model(model)
-        check_iterations(iterations or 0, damping, tolerance)
+        check_iterations(iterations, damping, tolerance)
         if tolerance is not None:
             checks.positive("tolerance", tolerance, "It is in standard deviations, 0.001 for example.")
         checks.one_of("method", method, METHODS)
@@ -141,10 +139,7 @@ class MarginalLikelihood(SeriesLikelihood):
         self.tolerance, self.method = None if tolerance is None else float(tolerance), method
         self.sites = None if sites is None else as_settings(sites)
         super().__init__(model, times, rule, steps)
-        if iterations is None:
-            is_single_pass = self.is_family or tolerance is not None or self.is_affine
-            iterations = 0 if is_single_pass else DEFAULT_ITERATIONS
-        self.iterations = iterations
+        self.iterations = number_of_iterations(iterations, self.ssm, self.tolerance)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from lfm_ppl.filtering.forward import forward
 from lfm_ppl.filtering.grid_layout import GridLayout
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.iterated import posterior_linearisation
-from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_linear, is_observation_nonlinear
+from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_affine
 from lfm_ppl.filtering.smoother import SmootherResult, smooth_on
 from lfm_ppl.filtering.time_grid import build_time_grid, lay_out_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
@@ -117,7 +117,7 @@ class SeriesLikelihood(dist.Distribution):
     @property
     def is_affine(self) -> bool:
         """Whether dynamics and observation are affine in states and forces, with noise independent of them."""
-        return is_linear(self.ssm) and not is_observation_nonlinear(self.ssm)
+        return is_affine(self.ssm)
 
     @property
     def is_family(self) -> bool:
@@ -194,7 +194,10 @@ class SeriesLikelihood(dist.Distribution):
         return super().expand(batch_shape)
 
     def filter(self, y: Any) -> FilterResult:
-        """Filter with this distribution's rule and steps; see `lfm_ppl.filter`. Constraints are ignored."""
+        """Filter with this distribution's rule and steps; see `lfm_ppl.filter`. Constraints are ignored.
+
+        It is a single pass, also where `log_prob` and `smooth` iterate posterior linearisation.
+        """
         y = self.checked(y)
         return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
 
