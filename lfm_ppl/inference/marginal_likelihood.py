@@ -94,7 +94,9 @@ class MarginalLikelihood(SeriesLikelihood):
             failure is a log density of -inf.
 
     Warns:
-        FilterWarning: outside of compiled code, where a log density is -inf or sites do not converge: where and how.
+        FilterWarning: outside of compiled code, where a log density is -inf or sites do not converge: where and how;
+            where the last iteration changes a smoothed mean by more than one standard deviation, or the log density by
+            more than 0.5.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -186,7 +188,7 @@ class MarginalLikelihood(SeriesLikelihood):
             log_likelihood, has_converged = finite_or_minus_infinity(self._evidence_and_convergence, y)
         else:
             # The guard is around the sum: one failure makes it -inf, and the derivatives of all other terms zero.
-            log_likelihood = finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y)
+            log_likelihood = self._guarded_terms(y, lambda terms: terms.sum(keepdims=True))[0]
         warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood, self.site_settings,
                           has_converged)
         return log_likelihood
