@@ -50,9 +50,9 @@ def check_observations(y: Any, count: int, outputs: int, empty: bool = False,
     return jnp.asarray(y, float)
 
 
-def check_iterations(iterations: int, damping: float, tolerance: float | None = None) -> None:
+def check_iterations(iterations: int | None, damping: float, tolerance: float | None = None) -> None:
     """Raise ValueError for a negative number of iterations, a damping outside (0, 1], or a tolerance beside them."""
-    if iterations != 0:
+    if iterations is not None and iterations != 0:
         checks.positive_integer("iterations", iterations)
     if not 0 < damping <= 1:
         raise ValueError("damping must lie in (0, 1] (the largest fraction of each new iterate that is taken), "

@@ -38,8 +38,18 @@ _HUGE = 1e6
 """Growth of a standard deviation within a row, or size of it, above which the message mentions it."""
 
 
+_LARGEST_CHANGE = 1.0
+"""Change of a smoothed mean in the last iteration, in standard deviations, above which iterations have not settled."""
+
+_LARGEST_LOG_LIKELIHOOD_CHANGE = 0.5
+"""The same for the change of the log likelihood."""
+
+
 class FilterWarning(UserWarning):
-    """The filter breaks down, its log likelihood is -inf, or sites do not converge. The message says where and how."""
+    """The filter breaks down, its log likelihood is -inf, or sites or iterations do not converge.
+
+    The message says where and how.
+    """
 
 
 def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None,
@@ -67,6 +77,25 @@ def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, 
     checks.warn(breakdown(ssm, rule, grid, y, start) or "the log likelihood is -inf, but the filter does not break "
                 "down without posterior linearisation: try iterations=0, or a smaller damping, such as damping=0.5.",
                 FilterWarning)
+
+
+def warn_of_iterations(change: Any, log_likelihood_change: Any) -> None:
+    """Warn where iterations of posterior linearisation have not settled; nothing happens in compiled code.
+
+    Args:
+        change: largest change of a smoothed mean in the last iteration, in standard deviations; NaN for none.
+        log_likelihood_change: change of the log likelihood in the last iteration; NaN for none.
+    """
+    if checks.traced((change, log_likelihood_change)):
+        return
+    sds, difference = float(change), abs(float(log_likelihood_change))
+    # A log likelihood that is not finite has its own warning.
+    if not np.isfinite(difference) or not (sds > _LARGEST_CHANGE or difference > _LARGEST_LOG_LIKELIHOOD_CHANGE):
+        return
+    checks.warn(f"the last iteration of posterior linearisation changes a smoothed mean by {sds:.2g} standard "
+                f"deviations and the log likelihood by {difference:.2g}, so that both may be wrong: try more "
+                "iterations (iterations=10), more integration steps (steps=...), a smaller damping, such as "
+                "damping=0.3, or a single pass (iterations=0), and compare with lfm.check_accuracy.", FilterWarning)
 
 
 def family_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, settings: SiteSettings | None,

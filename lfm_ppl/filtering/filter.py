@@ -77,6 +77,9 @@ def filter(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     observation they are conditioned on it. For an observation family, the predictor given an observation has the
     moments of its tilted prediction (assumed density filtering).
 
+    The filter is a single pass. The log likelihood of a model that is not linear therefore differs from that of
+    `lfm_ppl.MarginalLikelihood` and `lfm_ppl.smooth`, which iterate by default, and is that of ``iterations=0``.
+
     Args:
         model: the latent force model; its functions are read once for each model, as by `jax.jit`.
         times: (T,), non-decreasing; equal times are replicates.

@@ -10,7 +10,11 @@ r"""Iterated posterior linearisation: smooth, linearise about the smoothed margi
        s / (1 - lambda),    lambda = sum_i r_i r'_i / v_i  /  sum_i r'_i^2 / v_i,
 
    with the variances v, and at most the damping: means that alternate between two values meet between them.
-4. The caller makes the final forward pass about the result: n iterations are n forward and n backward scans, and one
+4. The standard deviations at the nodes are at most those that the first pass predicts there (`predicted_variance`). In
+   a linear model smoothed variances never exceed them. Where a path crosses an unstable point they do: the linearised
+   flow grows between two observations, as the model's own does not, and rules that average over such a variance give
+   rates that explicit steps do not resolve.
+5. The caller makes the final forward pass about the result: n iterations are n forward and n backward scans, and one
    forward scan more.
 
 The gradient is that of the unrolled iterations, since a fixed number of them is a smooth function of the parameters.
@@ -25,13 +29,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl.filtering.backward import SmootherTrace, backward
+from lfm_ppl.filtering.backward import SmootherTrace, at_interval_starts, backward
 from lfm_ppl.filtering.dynamics import columns, linearization_indices
 from lfm_ppl.filtering.forward import FilterTrace, LinearizationPoints, NodeRecord, forward
 from lfm_ppl.filtering.moments import Moments, Record, matvec
-from lfm_ppl.filtering.problem import FilterProblem, is_observation_nonlinear
+from lfm_ppl.filtering.problem import FilterProblem, is_affine, is_observation_nonlinear
 from lfm_ppl.filtering.update import Updater
+from lfm_ppl.model.observations.family import ObservationFamily
+from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils.linalg import congruence, safe_sqrt
+
+DEFAULT_ITERATIONS = 3
+"""Iterations of posterior linearisation of models that are not linear."""
 
 _NEGLIGIBLE_STEP = 1e-8
 """Square of a step, in standard deviations, below which the secant method has no information."""
@@ -42,11 +51,13 @@ class IterationResult(NamedTuple):
 
     Attributes:
         points: moments about which the last pass is linearised.
-        change: largest change of a mean in the last iteration, in standard deviations.
+        change: largest change of a mean in the last iteration, in standard deviations; NaN with one iteration.
+        log_likelihood: of the pass of the last iteration, about the points before the last ones; NaN with one.
     """
 
     points: LinearizationPoints
     change: jax.Array
+    log_likelihood: jax.Array
 
 
 class _Iterate(NamedTuple):
@@ -65,6 +76,17 @@ class _Iterate(NamedTuple):
     change: jax.Array
 
 
+def number_of_iterations(iterations: int | None, ssm: StateSpaceModel, tolerance: float | None) -> int:
+    """Return the number of iterations of the smoother and of the likelihood, the default for None.
+
+    A linear model, an observation family and steps that follow a tolerance take none by default.
+    """
+    if iterations is not None:
+        return iterations
+    is_family = isinstance(ssm.model.observation, ObservationFamily)
+    return 0 if is_family or tolerance is not None or is_affine(ssm) else DEFAULT_ITERATIONS
+
+
 def posterior_linearisation(problem: FilterProblem, updater: Updater, iterations: int,
                             damping: float) -> IterationResult:
     """Return the moments after a fixed number of iterations, so that they are smooth in the parameters.
@@ -75,21 +97,59 @@ def posterior_linearisation(problem: FilterProblem, updater: Updater, iterations
         iterations: number of forward and backward scans.
         damping: largest fraction of the new marginals that is taken, in (0, 1].
     """
-    def smooth_about(points: LinearizationPoints | None) -> LinearizationPoints:
-        trace = forward(problem, updater, about=points, record=Record.LINEARIZATION)
+    def smooth(trace: FilterTrace) -> LinearizationPoints:
         return smoothed_points(problem, trace, backward(problem, trace, adjoint_only=True))
 
-    def iterate(iterates: list[_Iterate | None], _: None) -> tuple[list[_Iterate | None], None]:
-        smoothed = smooth_about(_points_of(iterates))
-        return [None if old is None or new is None else _damped_update(old, new, damping)
-                for old, new in zip(iterates, smoothed, strict=True)], None
+    single_pass = forward(problem, updater, record=Record.LINEARIZATION)
+    largest = predicted_variance(problem, single_pass)
 
-    first = [None if moments is None else _Iterate(moments, jnp.zeros_like(moments.mean),
-                                                   jnp.full(moments.mean.shape[:-1], damping), jnp.asarray(jnp.nan))
-             for moments in smooth_about(None)]
-    last, _ = jax.lax.scan(iterate, first, None, length=iterations - 1)
+    def limit(nodes: _Iterate) -> _Iterate:
+        return nodes if largest is None else nodes._replace(moments=limit_variance(nodes.moments, largest))
+
+    def iterate(iterates: list[_Iterate | None], _: None) -> tuple[list[_Iterate | None], jax.Array]:
+        trace = forward(problem, updater, about=_points_of(iterates), record=Record.LINEARIZATION)
+        smoothed = smooth(trace)
+        nodes, end_moments = (None if old is None or new is None else _damped_update(old, new, damping)
+                              for old, new in zip(iterates, smoothed, strict=True))
+        assert nodes is not None
+        return [limit(nodes), end_moments], trace.log_likelihood.sum()
+
+    nodes, end_moments = (
+        None if moments is None else _Iterate(moments, jnp.zeros_like(moments.mean),
+                                              jnp.full(moments.mean.shape[:-1], damping), jnp.asarray(jnp.nan))
+        for moments in smooth(single_pass))
+    assert nodes is not None
+    last, log_likelihoods = jax.lax.scan(iterate, [limit(nodes), end_moments], None, length=iterations - 1)
     change = jnp.max(jnp.stack([iterate.change for iterate in last if iterate is not None]))
-    return IterationResult(_points_of(last), change)
+    log_likelihood = log_likelihoods[-1] if iterations > 1 else jnp.asarray(jnp.nan)
+    return IterationResult(_points_of(last), change, log_likelihood)
+
+
+def predicted_variance(problem: FilterProblem, single_pass: FilterTrace) -> jax.Array | None:
+    """Return the variances (N, J + 1, k) that the first pass predicts at the nodes; None where it records no steps.
+
+    At the start of an interval it is the filtered variance there.
+    """
+    if single_pass.nodes is None:
+        return None
+    indices = linearization_indices(problem.ssm, problem.rule)
+
+    def variance(covariance: jax.Array) -> jax.Array:
+        return jnp.diagonal(covariance, axis1=-2, axis2=-1)
+
+    at_start = at_interval_starts(single_pass.filtered, single_pass.initial).covariance
+    inner = variance(single_pass.nodes.moments.covariance)
+    return jnp.concatenate([columns(variance(at_start), indices)[:, None], inner], axis=1)
+
+
+def limit_variance(moments: Moments, largest: jax.Array) -> Moments:
+    """Return the moments with variances of at most ``largest``; correlations, and what is below it, are unchanged."""
+    variance = jnp.diagonal(moments.covariance, axis1=-2, axis2=-1)
+    is_above = variance > largest
+    # Both branches of a derivative must be finite.
+    ratio = jnp.where(is_above, largest, 1.0) / jnp.where(is_above, variance, 1.0)
+    factor = jnp.where(is_above, safe_sqrt(ratio), 1.0)
+    return moments._replace(covariance=factor[..., :, None] * moments.covariance * factor[..., None, :])
 
 
 def _points_of(iterates: list[_Iterate | None]) -> LinearizationPoints:

@@ -111,6 +111,11 @@ def is_linear(ssm: StateSpaceModel) -> bool:
     return ssm.drift_structure.linear and ssm.observation_structure.linear
 
 
+def is_affine(ssm: StateSpaceModel) -> bool:
+    """Return whether dynamics and observation are affine in states and forces, with noise independent of them."""
+    return is_linear(ssm) and not is_observation_nonlinear(ssm)
+
+
 def at_intervals(tree: Any, intervals: Any) -> Any:
     """Return the entries of arrays (N, ...) at intervals; all of them without a gather, a scatter in reverse mode."""
 

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.arguments import as_rule, check_iterations, check_observations, warn_single_precision
 from lfm_ppl.filtering.backward import backward
-from lfm_ppl.filtering.breakdown import warn_of_breakdown
+from lfm_ppl.filtering.breakdown import warn_of_breakdown, warn_of_iterations
 from lfm_ppl.filtering.ep.evidence import evidence, leave_one_out
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter, quantile_residuals
 from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
@@ -28,7 +28,7 @@ from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.filter import whitened_innovations
 from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid
-from lfm_ppl.filtering.iterated import posterior_linearisation
+from lfm_ppl.filtering.iterated import number_of_iterations, posterior_linearisation
 from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
 from lfm_ppl.filtering.sample import sample_errors
@@ -78,6 +78,7 @@ class SmootherResult(eqx.Module):
             of an observation family, NaN where missing.
         change: largest change of a smoothed mean in the last iteration, in smoothed standard deviations; NaN
             with fewer than two iterations.
+        log_likelihood_change: change of the sum of ``log_likelihood`` in the last iteration; NaN with fewer than two.
         converged: whether the sites of an observation family have converged; true where there are none. Where they
             have not, a model that is not linear is smoothed with the sites of assumed density filtering, and
             ``leave_one_out`` is ``log_likelihood``; in a linear model both are -inf.
@@ -92,6 +93,7 @@ class SmootherResult(eqx.Module):
     leave_one_out: jax.Array
     whitened_innovation: jax.Array
     change: jax.Array
+    log_likelihood_change: jax.Array
     converged: jax.Array
     _trace: FilterTrace
     _requested: jax.Array
@@ -158,8 +160,8 @@ def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
 
 
 def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule | None = None, steps: int = 10,
-           max_step: float | None = None, at: ArrayLike | None = None, iterations: int = 0, damping: float = 0.7,
-           tolerance: float | None = None, sites: SiteSettings | str | None = None,
+           max_step: float | None = None, at: ArrayLike | None = None, iterations: int | None = None,
+           damping: float = 0.7, tolerance: float | None = None, sites: SiteSettings | str | None = None,
            method: str = RUNGE_KUTTA) -> SmootherResult:
     """Smooth: the state and the forces given all observations.
 
@@ -176,7 +178,8 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         at: (K,) times at which results are wanted, in any order, also after the last observation (a forecast).
             The observation times by default. They end intervals of the scan, so that results elsewhere change by the
             error of the integration steps.
-        iterations: of posterior linearisation, 0 for none.
+        iterations: of posterior linearisation; 0 for none. The default is that of `lfm_ppl.MarginalLikelihood`, 3 for
+            a model that is not linear, so that both compute the same log likelihood.
         damping: largest fraction of each new iterate that is taken, in (0, 1]; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
         method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
@@ -190,7 +193,8 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         ValueError, TypeError: as `lfm_ppl.filter`; also for a requested time before the initial time.
 
     Warns:
-        FilterWarning: as `lfm_ppl.filter`.
+        FilterWarning: as `lfm_ppl.filter`; also where the last iteration changes a smoothed mean by more than one
+            standard deviation, or the log likelihood by more than 0.5.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -206,8 +210,9 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     rule = as_rule(rule)
     checks.one_of("method", method, METHODS)
     check_iterations(iterations, damping, tolerance)
-    settings = as_settings(sites, iterations)
     ssm = state_space(model)
+    iterations = number_of_iterations(iterations, ssm, tolerance)
+    settings = as_settings(sites, iterations)
     grid = build_time_grid(ssm, times, steps, max_step, at, tolerance=tolerance)._replace(method=method)
     model.check_at(grid.initial_time, np.shape(times)[0])
     check_resolution(model, times, y)
@@ -215,6 +220,8 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     warn_single_precision()
     result = _compiled_smooth(ssm, rule, grid, y, iterations, damping, settings)
     warn_of_breakdown(ssm, rule, grid, y, None, result.log_likelihood, settings, result.converged)
+    if not isinstance(model.observation, ObservationFamily):
+        warn_of_iterations(result.change, result.log_likelihood_change)
     return result
 
 
@@ -240,15 +247,17 @@ def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int,
                      damping: float) -> tuple[FilterTrace, Moments, dict[str, jax.Array]]:
     """Return the forward pass, the smoothed moments and the diagnostics, fields of the result by name."""
     updater, points, change = GaussianUpdate(y), None, jnp.asarray(jnp.nan)
+    previous = change
     if iterations:
-        points, change = posterior_linearisation(problem, updater, iterations, damping)
+        points, change, previous = posterior_linearisation(problem, updater, iterations, damping)
     trace = forward(problem, updater, about=points, record=Record.SMOOTHER)
     smoothed = backward(problem, trace)
     at_data, left_out = at_intervals((trace._replace(initial=None), smoothed.leave_one_out), problem.grid.observed)
     residual = whitened_innovations(at_data, y)
     return trace, smoothed.moments, {
         "log_likelihood": at_data.log_likelihood, "leave_one_out": left_out, "whitened_innovation": residual,
-        "change": change, "converged": jnp.asarray(True)}
+        "change": change, "log_likelihood_change": at_data.log_likelihood.sum() - previous,
+        "converged": jnp.asarray(True)}
 
 
 def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings,
@@ -267,7 +276,7 @@ def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings,
     residual = quantile_residuals(family, prequential.prediction, y)
     return result.trace, smoothed.moments, {
         "log_likelihood": one_step_ahead, "leave_one_out": left_out, "whitened_innovation": residual,
-        "change": change, "converged": fixed_point.converged}
+        "change": change, "log_likelihood_change": jnp.asarray(jnp.nan), "converged": fixed_point.converged}
 
 
 _compiled_smooth = shared_jit(smooth_on)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from numpyro.infer import init_to_median
 
+from lfm_ppl.filtering.breakdown import warn_of_iterations
 from lfm_ppl.filtering.filter import FilterResult
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.inference.handlers.fixing import fix
@@ -395,6 +396,8 @@ class BoundModel:
     def filter(self, z: ArrayLike | Mapping[str, Any], y: ArrayLike | None = None) -> FilterResult:
         """Return the result of the Gaussian filter at parameters z (d,), or site name -> value; see `lfm_ppl.filter`.
 
+        It is a single pass, also where `log_density` iterates posterior linearisation.
+
         Raises:
             ValueError: the model is a panel, whose series are filtered one by one.
         """
@@ -417,6 +420,9 @@ class BoundModel:
 
         Raises:
             ValueError: the model is a panel, whose series are smoothed one by one.
+
+        Warns:
+            FilterWarning: the iterations have not settled, as in `lfm_ppl.smooth`.
         """
         self._check_single("smooth")
         checks.refuse_dates("at", at)
@@ -427,10 +433,14 @@ class BoundModel:
             return site.distribution.smooth(site.observed, times)
 
         if times is None:
-            return self.program("smooth", lambda: Program(run))(_as_arrays(z), self._arguments(y))
-        data = self._all_data(y)
-        return self.compiled(("smooth", signature(times)), lambda: Program(run))(
-            _as_arrays(z), None if self.argument is None else data)
+            result = self.program("smooth", lambda: Program(run))(_as_arrays(z), self._arguments(y))
+        else:
+            data = self._all_data(y)
+            result = self.compiled(("smooth", signature(times)), lambda: Program(run))(
+                _as_arrays(z), None if self.argument is None else data)
+        if isinstance(result, SmootherResult) and not self.site.example.is_family:
+            warn_of_iterations(result.change, result.log_likelihood_change)
+        return result
 
     def _check_single(self, name: str) -> None:
         if isinstance(self.site.distribution, Panel):

@@ -25,6 +25,7 @@ from lfm_ppl.filtering.ep.evidence import Evidence, evidence
 from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA
+from lfm_ppl.filtering.iterated import number_of_iterations
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
@@ -37,9 +38,6 @@ from lfm_ppl.utils.gradients import finite_or_minus_infinity
 
 SIMULATION_STEPS = 5
 """Steps of the simulator for one integration step of the filter: its paths are rougher than moments."""
-
-DEFAULT_ITERATIONS = 3
-"""Iterations of posterior linearisation of models that are not linear."""
 
 
 class MarginalLikelihood(SeriesLikelihood):
@@ -97,7 +95,9 @@ class MarginalLikelihood(SeriesLikelihood):
             failure is a log density of -inf.
 
     Warns:
-        FilterWarning: outside of compiled code, where a log density is -inf or sites do not converge: where and how.
+        FilterWarning: outside of compiled code, where a log density is -inf or sites do not converge: where and how;
+            where the last iteration changes a smoothed mean by more than one standard deviation, or the log density by
+            more than 0.5.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -131,7 +131,7 @@ class MarginalLikelihood(SeriesLikelihood):
                  constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (),
                  grid: ArrayLike | int | None = None, draws: int = 256, validate_args: bool | None = None):
         _check_model(model)
-        check_iterations(iterations or 0, damping, tolerance)
+        check_iterations(iterations, damping, tolerance)
         if tolerance is not None:
             checks.positive("tolerance", tolerance, "It is in standard deviations, 0.001 for example.")
         checks.one_of("method", method, METHODS)
@@ -142,10 +142,7 @@ class MarginalLikelihood(SeriesLikelihood):
         self.tolerance, self.method = None if tolerance is None else float(tolerance), method
         self.sites = None if sites is None else as_settings(sites)
         super().__init__(model, times, rule, steps)
-        if iterations is None:
-            is_single_pass = self.is_family or tolerance is not None or self.is_affine
-            iterations = 0 if is_single_pass else DEFAULT_ITERATIONS
-        self.iterations = iterations
+        self.iterations = number_of_iterations(iterations, self.ssm, self.tolerance)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -198,7 +195,7 @@ class MarginalLikelihood(SeriesLikelihood):
             log_likelihood, has_converged = finite_or_minus_infinity(self._evidence_and_convergence, y)
         else:
             # The guard is around the sum: one failure makes it -inf, and the derivatives of all other terms zero.
-            log_likelihood = finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y)
+            log_likelihood = self._guarded_terms(y, lambda terms: terms.sum(keepdims=True))[0]
         warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood, self.site_settings,
                           has_converged)
         return log_likelihood

@@ -21,7 +21,7 @@ from numpyro.distributions import constraints
 from numpyro.primitives import _PYRO_STACK
 
 from lfm_ppl.filtering.arguments import as_rule, check_observations, warn_single_precision
-from lfm_ppl.filtering.breakdown import warn_of_breakdown
+from lfm_ppl.filtering.breakdown import warn_of_breakdown, warn_of_iterations
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.filter import FilterResult, filter_on
@@ -29,7 +29,7 @@ from lfm_ppl.filtering.forward import forward
 from lfm_ppl.filtering.grid_layout import GridLayout
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.iterated import posterior_linearisation
-from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_linear, is_observation_nonlinear
+from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_affine
 from lfm_ppl.filtering.smoother import SmootherResult, smooth_on
 from lfm_ppl.filtering.time_grid import build_time_grid, lay_out_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
@@ -117,7 +117,7 @@ class SeriesLikelihood(dist.Distribution):
     @property
     def is_affine(self) -> bool:
         """Whether dynamics and observation are affine in states and forces, with noise independent of them."""
-        return is_linear(self.ssm) and not is_observation_nonlinear(self.ssm)
+        return is_affine(self.ssm)
 
     @property
     def is_family(self) -> bool:
@@ -194,7 +194,10 @@ class SeriesLikelihood(dist.Distribution):
         return super().expand(batch_shape)
 
     def filter(self, y: Any) -> FilterResult:
-        """Filter with this distribution's rule and steps; see `lfm_ppl.filter`. Constraints are ignored."""
+        """Filter with this distribution's rule and steps; see `lfm_ppl.filter`. Constraints are ignored.
+
+        It is a single pass, also where `log_prob` and `smooth` iterate posterior linearisation.
+        """
         y = self.checked(y)
         return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
 
@@ -216,7 +219,10 @@ class SeriesLikelihood(dist.Distribution):
             grid = build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at,
                                    tolerance=self.tolerance)._replace(method=self.method)
         y = self.checked(y)
-        return smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
+        result = smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
+        if not self.is_family:
+            warn_of_iterations(result.change, result.log_likelihood_change)
+        return result
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation.
@@ -224,7 +230,7 @@ class SeriesLikelihood(dist.Distribution):
         Under constraints these are terms of the unconstrained model, which do not sum to `log_prob`.
         """
         y = self.checked(value)
-        log_likelihood = finite_or_minus_infinity(self._one_step_ahead, y)
+        log_likelihood = self._guarded_terms(y, lambda terms: terms)
         warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood, None, True)
         return log_likelihood
 
@@ -260,17 +266,36 @@ class SeriesLikelihood(dist.Distribution):
         count, outputs = self.event_shape
         return check_observations(y, count, outputs, model=self.model)
 
-    def _one_step_ahead(self, y: jax.Array) -> jax.Array:
-        """Return (T,): log p(y_k | y_1:k-1), after posterior linearisation where there are iterations.
+    def _terms_and_changes(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return (T,): log p(y_k | y_1:k-1), and (2,): both changes in the last iteration, see `SmootherResult`.
 
         The terms of an observation family come from the assumed density filter.
         """
-        problem, updater, points = self.problem, GaussianUpdate(y), None
+        problem, updater, points, change = self.problem, GaussianUpdate(y), None, jnp.asarray(jnp.nan)
+        previous = change
         if self.is_family:
-            return assumed_density_filter(problem, y).log_likelihood
+            return assumed_density_filter(problem, y).log_likelihood, jnp.full(2, jnp.nan)
         if self.iterations:
-            points = posterior_linearisation(problem, updater, self.iterations, self.damping).points
-        return at_intervals(forward(problem, updater, about=points).log_likelihood, self.time_grid.observed)
+            points, change, previous = posterior_linearisation(problem, updater, self.iterations, self.damping)
+        terms = at_intervals(forward(problem, updater, about=points).log_likelihood, self.time_grid.observed)
+        return terms, jnp.stack([change, terms.sum() - previous])
+
+    def _guarded_terms(self, y: jax.Array, reduce: Callable[[jax.Array], jax.Array]) -> jax.Array:
+        """Return an array, such as their sum, of the terms log p(y_k | y_1:k-1), -inf where it is not finite.
+
+        Outside of compiled code there is a warning where the iterations have not settled.
+        """
+        if self.is_family or self.iterations < 2 or checks.traced((self.ssm, self.time_grid, y)):
+            return finite_or_minus_infinity(lambda y: reduce(self._terms_and_changes(y)[0]), y)
+
+        def values_and_changes(y: jax.Array) -> jax.Array:
+            terms, changes = self._terms_and_changes(y)
+            # User functions may hold tracers that the model's leaves do not show.
+            return jnp.append(reduce(terms), jax.lax.stop_gradient(changes))
+
+        values = finite_or_minus_infinity(values_and_changes, y)
+        warn_of_iterations(*values[-2:])
+        return values[:-2]
 
 
 def refuse_times_by_site(times: Any) -> None:

@@ -21,10 +21,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from lfm_ppl.filtering.iterated import DEFAULT_ITERATIONS
 from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
-from lfm_ppl.inference.marginal_likelihood import DEFAULT_ITERATIONS
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.posterior import evenly_spaced
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood

@@ -95,7 +95,7 @@ def _estimate_by_smoother(values: jax.Array, y: jax.Array) -> tuple[jax.Array, .
 def _estimate_with_link(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     """Return the mean of softplus(u) by quadrature, and its shortest 95% interval."""
     model = problem.transcription(*values, softplus=True)
-    force = smooth(model, TIMES, y, rule=GaussHermite(5), steps=1).force(FACTOR)
+    force = smooth(model, TIMES, y, rule=GaussHermite(5), steps=1, iterations=0).force(FACTOR)
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     mean = (weights / weights.sum() * jax.nn.softplus(force.mean[:, None] + force.sd[:, None] * nodes)).sum(axis=1)
     below, above = (norm.ppf(jnp.asarray(shares))[:, None] for shares in (_BELOW, _BELOW + 0.95))

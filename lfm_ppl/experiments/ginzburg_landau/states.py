@@ -92,7 +92,7 @@ def solve(method: str, theta: jax.Array, sparse: jax.Array, fine: np.ndarray, si
     system = problem.system(theta)
     if method in problem.GAUSSIAN:
         filtered = gaussian_filter(system, fine, sparse, problem.GAUSSIAN[method], size)
-        smoothed = smooth(system, fine, sparse, problem.GAUSSIAN[method], size)
+        smoothed = smooth(system, fine, sparse, problem.GAUSSIAN[method], size, iterations=0)
         return (smoothed.log_likelihood.sum(), (filtered.filtered_mean[:, 0], filtered.filtered_covariance[:, 0, 0]),
                 (smoothed.mean[:, 0], smoothed.covariance[:, 0, 0]), ())
     ssm, cells = state_space(system), build_grid(size)

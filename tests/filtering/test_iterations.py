@@ -1,0 +1,241 @@
+"""Iterated posterior linearisation: one default, a log likelihood near an exact one, and a warning where it is not."""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import random_models
+from scipy.linalg import expm
+from systems import DoubleWell, double_well, motif, softplus, whole_state
+
+import lfm_ppl as lfm
+from lfm_ppl.filtering.iterated import limit_variance
+from lfm_ppl.filtering.moments import Moments
+
+TIMES = np.array([0.4, 1.1, 1.9, 2.6])
+Y = np.array([0.3, 0.8, 0.5, 0.9])[:, None]
+ROWS, WELLS = 20, 20
+
+
+class Well(NamedTuple):
+    """A double well dx = strength (x - x^3) dt + dispersion dB with rows ``spacing`` apart, or an array of each."""
+
+    strength: float
+    dispersion: float
+    noise: float
+    spacing: float
+    mean: float
+    variance: float
+
+
+BREAKING = (
+    (Well(7.6, 0.7, 0.03, 0.5, 1.0, 1.0), [-1.204, -0.737, -1.262, -0.671, -0.984, -0.637, -0.903, -1.15]),
+)
+"""Wells with a wide initial state, and data of the other well: unlimited iterations are off by -14 (single pass .2)."""
+
+EDGES = np.linspace(-3.2, 3.2, 402)
+CELLS = 0.5 * (EDGES[1:] + EDGES[:-1])
+WIDTH = EDGES[1] - EDGES[0]
+
+
+def transition(well: Well) -> np.ndarray:
+    """Return the masses of the cells after one interval, by column of the cell at its start (finite volumes)."""
+    diffusion, inner = 0.5 * well.dispersion**2, EDGES[1:-1]
+    peclet = well.strength * (inner - inner**3) * WIDTH / diffusion + 1e-12
+    up, down = (diffusion / WIDTH**2 * z / np.expm1(z) for z in (-peclet, peclet))
+    generator = np.diag(up, -1) + np.diag(down, 1)
+    return np.maximum(expm((generator - np.diag(generator.sum(0))) * well.spacing), 0.0)
+
+
+def density(residual: np.ndarray, variance: float) -> np.ndarray:
+    return np.exp(-0.5 * residual**2 / variance) / np.sqrt(2 * np.pi * variance)
+
+
+def exact_log_likelihood(well: Well, y: np.ndarray, step: np.ndarray | None = None) -> float:
+    step = transition(well) if step is None else step
+    mass, total = density(CELLS - well.mean, well.variance), 0.0
+    mass /= mass.sum()
+    for value in y:
+        mass = (step @ mass) * density(value - CELLS, well.noise)
+        total += np.log(mass.sum())
+        mass /= mass.sum()
+    return total
+
+
+def observe(well: Well, step: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Draw a path through the cells, which starts in the well of the initial mean, and observe it."""
+    cell, y = int(np.argmin(np.abs(CELLS - np.sign(well.mean)))), []
+    for _ in range(ROWS):
+        cell = generator.choice(CELLS.size, p=step[:, cell] / step[:, cell].sum())
+        y.append(CELLS[cell] + np.sqrt(well.noise) * generator.normal())
+    return np.array(y)
+
+
+def random_wells(count: int) -> tuple[Well, np.ndarray, np.ndarray]:
+    """Return wells (count,) whose paths start in either well, y (count, ROWS), and exact log likelihoods (count,)."""
+    generator, wells, data, exact = np.random.default_rng(8), [], [], []
+    for index in range(count):
+        strength, dispersion, noise = np.exp(generator.uniform(np.log([1.0, 0.4, 0.01]), np.log([10.0, 1.1, 0.1])))
+        well = Well(strength, dispersion, noise, generator.uniform(0.1, 0.6), (-1.0) ** index, 0.15)
+        step = transition(well)
+        data.append(observe(well, step, generator))
+        exact.append(exact_log_likelihood(well, data[-1], step))
+        wells.append(well)
+    return Well(*map(np.array, zip(*wells, strict=True))), np.array(data), np.array(exact)
+
+
+def model_of(well: Well) -> lfm.LatentForceModel:
+    return double_well(well.mean, well.variance, well.dispersion, well.noise, -well.strength, well.strength)
+
+
+def smooth_well(well: Well, y: jax.Array, **settings) -> lfm.SmootherResult:
+    return lfm.smooth(model_of(well), well.spacing * jnp.arange(1, y.shape[0] + 1), y[:, None], **settings)
+
+
+def has_settled(change, log_likelihood_change) -> np.ndarray:
+    """Return where there is no warning."""
+    return (np.asarray(change) <= 1.0) & (np.abs(np.asarray(log_likelihood_change)) <= 0.5)
+
+
+def curved(x, u, t):
+    return x + 0.3 * x**2
+
+
+def curved_observation():
+    return lfm.LatentForceModel(
+        DoubleWell(1.0, 0.0), {}, lfm.GaussianObservation(curved, jnp.array([0.05])),
+        lfm.Gaussian(jnp.array([0.3]), jnp.array([0.2])), process_noise=jnp.array([[0.4]]), initial_time=0.0)
+
+
+@pytest.mark.parametrize("model", [
+    double_well(), motif(softplus, genes=1), pytest.param(curved_observation(), marks=pytest.mark.slow),
+], ids=["state", "force", "observation"])
+def test_smoother_and_likelihood_have_one_default(model):
+    likelihood = lfm.MarginalLikelihood(model, TIMES)
+    result = lfm.smooth(model, TIMES, Y)
+    assert likelihood.iterations == 3
+    assert np.isclose(result.log_likelihood.sum(), likelihood.log_prob(Y), rtol=1e-12)
+    assert abs(result.log_likelihood.sum() - lfm.filter(model, TIMES, Y).log_likelihood.sum()) > 1e-3
+    assert np.isfinite(result.change)
+
+
+def test_a_single_pass_is_the_default_of_a_linear_model_and_with_a_tolerance():
+    linear = lfm.LatentForceModel(
+        DoubleWell(1.0, 0.0), {}, lfm.GaussianObservation(whole_state, jnp.array([0.05])),
+        lfm.Gaussian(jnp.array([0.3]), jnp.array([0.2])), process_noise=jnp.array([[0.4]]), initial_time=0.0)
+    for model, settings in ((motif(lambda u: u, genes=1), {}), (double_well(), {"tolerance": 1e-3})):
+        result = lfm.smooth(model, TIMES, Y, **settings)
+        assert lfm.MarginalLikelihood(model, TIMES, **settings).iterations == 0
+        assert np.isnan(result.change) and np.isnan(result.log_likelihood_change)
+    assert lfm.MarginalLikelihood(linear, TIMES).iterations in (0, 3)
+
+
+def test_iterations_that_go_wrong_warn_outside_of_compiled_code():
+    well, y = BREAKING[0]
+    model, times, y = model_of(well), well.spacing * np.arange(1, len(BREAKING[0][1]) + 1), np.array(y)[:, None]
+    likelihood = lfm.MarginalLikelihood(model, times)
+    for run in (lambda: lfm.smooth(model, times, y).log_likelihood.sum(), lambda: likelihood.log_prob(y),
+                lambda: likelihood.log_prob_per_observation(y).sum(), lambda: likelihood.smooth(y).log_likelihood.sum()):
+        with pytest.warns(lfm.FilterWarning, match=r"last iteration .* \d.* standard deviations .*steps=.*iterations=0"):
+            value = run()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert np.isclose(jax.jit(run)(), value, rtol=1e-9), "compiled code says nothing"
+
+
+@pytest.mark.parametrize(("well", "y"), BREAKING)
+def test_unstable_points_do_not_inflate_the_linearisation(well, y):
+    exact = exact_log_likelihood(well, np.array(y))
+    result = jax.jit(smooth_well)(well, jnp.array(y))
+    assert abs(result.log_likelihood.sum() - exact) < 1.2
+
+
+def test_limited_variances_keep_correlations_and_have_finite_derivatives():
+    covariance = jnp.array([[4.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    moments = Moments(jnp.arange(3.0), covariance)
+    limited = limit_variance(moments, jnp.array([1.0, 2.0, 0.0]))
+    np.testing.assert_allclose(limited.covariance, [[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(limited.mean, moments.mean)
+    for largest in (jnp.diagonal(covariance), jnp.array([1.0, 0.0, 0.0]), jnp.array([9.0, 9.0, 0.0])):
+        slopes = jax.grad(lambda c, v: limit_variance(Moments(moments.mean, c), v).covariance.sum(), (0, 1))(
+            covariance, largest)
+        assert all(np.isfinite(slope).all() for slope in slopes)
+    np.testing.assert_array_equal(limit_variance(moments, jnp.array([9.0, 9.0, 0.0])).covariance, covariance)
+
+
+def test_the_default_is_near_the_exact_likelihood_of_double_wells():
+    wells, y, exact = random_wells(WELLS)
+    result = jax.jit(jax.vmap(smooth_well))(wells, jnp.asarray(y))
+    error = np.abs(np.asarray(result.log_likelihood.sum(1)) - exact)
+    assert np.median(error) <= 0.1
+    assert not (has_settled(result.change, result.log_likelihood_change) & (error > 1.0)).any()
+
+
+def random_nonlinear_models(count: int):
+    """Yield models that are not linear, of one or two states with process noise, times, and data that they made."""
+    generator, seed = np.random.default_rng(4), 0
+    while count:
+        structure = random_models.structure(seed)._replace(process_noise=True)
+        seed += 1
+        is_small = structure.states < 3 and len(structure.forces) < 3
+        if structure.linear or structure.jumps or not is_small or any(name in LARGE_FORCES for name in structure.forces):
+            continue
+        states, forces, outputs = structure.states, len(structure.forces), structure.outputs
+        model = random_models.build(structure, {
+            "system": 0.3 * generator.normal(size=(states, states)) - generator.uniform(0.5, 1.5) * np.eye(states),
+            "coupling": generator.normal(size=(states, forces)), "strength": 0.7 * generator.normal(size=states),
+            "matrix": np.eye(outputs, states + forces), "scale": generator.uniform(0.3, 1.0, forces),
+            "length": generator.uniform(0.5, 3.0, forces), "rate": generator.uniform(0.05, 1.0, forces),
+            "noise": generator.uniform(0.01, 0.1, outputs), "variance": generator.uniform(0.05, 0.5, states),
+            "mean": generator.normal(size=states), "dispersion": generator.uniform(0.1, 0.5, states)})
+        times = np.cumsum(generator.uniform(0.2, 0.6, ROWS))
+        yield model, times, np.asarray(lfm.simulate(jax.random.key(seed), model, times).y)
+        count -= 1
+
+
+LARGE_FORCES = ("periodic", "CQM", "Matern weights", "resonators", "sum with CQM")
+"""Forces of so many states that particles say little."""
+
+
+def particle_log_likelihood(model, times, y, runs=8, particles=20_000, seed=0) -> tuple[float, float]:
+    """Return the log likelihood by runs of the bootstrap particle filter, and its standard error."""
+    run = jax.jit(lambda key: lfm.particle_filter(key, model, times, y, particles=particles).log_likelihood.sum())
+    values = np.array([run(key) for key in jax.random.split(jax.random.key(seed), runs)])
+    weights = np.exp(values - values.max())
+    return values.max() + np.log(weights.mean()), weights.std(ddof=1) / weights.mean() / np.sqrt(runs)
+
+
+@pytest.mark.slow
+def test_the_default_is_near_particles_for_random_models():
+    errors, settled = [], []
+    for model, times, y in random_nonlinear_models(12):
+        result = jax.jit(lambda model, y, times=times: lfm.smooth(model, times, y))(model, y)
+        exact, standard_error = particle_log_likelihood(model, times, y)
+        assert standard_error < 0.03
+        errors.append(abs(float(result.log_likelihood.sum()) - exact))
+        settled.append(bool(has_settled(result.change, result.log_likelihood_change)))
+        print(np.round(errors[-1], 3), np.round(standard_error, 3), float(result.change), settled[-1])
+        jax.clear_caches()
+    assert np.median(errors) <= 0.1
+    assert not (np.array(settled) & (np.array(errors) > 1.0)).any()
+
+
+@pytest.mark.slow
+def test_the_default_is_near_particles_for_double_wells():
+    """With an independent method for the reference of the test above."""
+    wells, y, exact = random_wells(WELLS)
+    run = jax.jit(lambda key, well, y: lfm.particle_filter(
+        key, model_of(well), well.spacing * jnp.arange(1, ROWS + 1), y[:, None], particles=20_000, steps=40
+    ).log_likelihood.sum())
+    for index in range(WELLS):
+        well = Well(*(float(column[index]) for column in wells))
+        keys = jax.random.split(jax.random.key(index), 8)
+        values = np.array([run(key, well, jnp.asarray(y[index])) for key in keys])
+        standard_error = values.std(ddof=1) / np.sqrt(len(keys))
+        assert standard_error < 0.03
+        assert abs(values.mean() - exact[index]) < 0.03 + 4 * standard_error
