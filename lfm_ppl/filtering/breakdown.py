@@ -169,7 +169,8 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
     if count > 1 and step is not None:
         where += f", step {step + 1} of {count} from time {interval.start[0]:.6g} to {interval.end[0]:.6g}"
     stiff = 'method="exponential" for stiff dynamics, ' if grid.method == RUNGE_KUTTA else ""
-    remedy = ("Try a tighter prior, an observation noise that is not so small, or other units" if ssm.time_invariant
+    remedy = ("Try a tighter prior, an observation noise that is not so small, or other units"
+              if has_exact_transitions(ssm, grid)
               else f"Try {stiff}more steps (up to five times steps={grid.steps} are tried), a larger tolerance, "
               "another rule, or a tighter prior" if grid.tolerance is not None
               else f"Try {stiff}more steps (steps=...), a longest step (max_step=...), steps that follow a tolerance "

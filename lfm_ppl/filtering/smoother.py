@@ -32,6 +32,7 @@ from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
 from lfm_ppl.filtering.sample import sample_errors
+from lfm_ppl.filtering.stiffness import warn_of_long_steps
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.rule import Rule
@@ -109,6 +110,10 @@ class SmootherResult(eqx.Module):
     def state(self, name: str) -> MeanSd:
         """Return mean (K,) and sd (K,) of a physical state."""
         return self._marginal("state", name, self.state_names, 0)
+
+    def filtered_mean_at(self, intervals: Any) -> jax.Array:
+        """Return the means (T, n) of the joint state after the observations at the ends of intervals of the grid."""
+        return self._trace.filtered.mean[jnp.asarray(intervals)]
 
     def _marginal(self, kind: str, name: str, names: tuple[str, ...], first: int) -> MeanSd:
         checks.one_of(kind, name, names)
@@ -214,6 +219,7 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     warn_single_precision()
     result = _compiled_smooth(ssm, rule, grid, y, iterations, damping, settings)
     warn_of_breakdown(ssm, rule, grid, y, None, result.log_likelihood, settings, result.converged)
+    warn_of_long_steps(ssm, rule, grid, lambda: result.filtered_mean_at(grid.observed), result.log_likelihood)
     return result
 
 

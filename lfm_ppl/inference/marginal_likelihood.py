@@ -96,7 +96,8 @@ class MarginalLikelihood(SeriesLikelihood):
             failure is a log density of -inf.
 
     Warns:
-        FilterWarning: outside of compiled code, where a log density is -inf or sites do not converge: where and how.
+        FilterWarning: outside of compiled code, where a log density is -inf or sites do not converge: where and how;
+            where an explicit step is too long for a fast decay: which state and row, and the remedy.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -194,6 +195,7 @@ class MarginalLikelihood(SeriesLikelihood):
             log_likelihood = finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y)
         warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood, self.site_settings,
                           has_converged)
+        self.warn_of_long_steps(y, log_likelihood)
         return log_likelihood
 
     def evidence(self, y: jax.Array) -> Evidence:

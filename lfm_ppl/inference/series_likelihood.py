@@ -31,6 +31,7 @@ from lfm_ppl.filtering.intervals import RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_linear, is_observation_nonlinear
 from lfm_ppl.filtering.smoother import SmootherResult, smooth_on
+from lfm_ppl.filtering.stiffness import ExplicitSteps, explicit_steps, has_explicit_steps, warn_of_long_steps
 from lfm_ppl.filtering.time_grid import build_time_grid, lay_out_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.rule import Rule
@@ -196,7 +197,22 @@ class SeriesLikelihood(dist.Distribution):
     def filter(self, y: Any) -> FilterResult:
         """Filter with this distribution's rule and steps; see `lfm_ppl.filter`. Constraints are ignored."""
         y = self.checked(y)
+        result = self._filter(y)
+        warn_of_long_steps(self.ssm, self.rule, self.time_grid, result.filtered_mean, result.log_likelihood)
+        return result
+
+    def _filter(self, y: jax.Array) -> FilterResult:
         return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
+
+    def warn_of_long_steps(self, y: jax.Array, log_likelihood: jax.Array) -> None:
+        """Warn where a step is too long for a fast decay, outside of compiled code; y (T, D) is checked."""
+        warn_of_long_steps(self.ssm, self.rule, self.time_grid, lambda: self._filter(y).filtered_mean, log_likelihood)
+
+    def explicit_steps(self, y: jax.Array) -> ExplicitSteps | None:
+        """Return what limits the explicit steps of the filter of ``y`` (T, D); None where there are none."""
+        if not has_explicit_steps(self.ssm, self.time_grid):
+            return None
+        return explicit_steps(self.ssm, self.time_grid, self._filter(y).filtered_mean)
 
     def smooth(self, y: Any, at: Any = None, steps: int | None = None) -> SmootherResult:
         """Smooth with this distribution's settings, or with other ``steps``; see `lfm_ppl.smooth`.
@@ -216,7 +232,10 @@ class SeriesLikelihood(dist.Distribution):
             grid = build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at,
                                    tolerance=self.tolerance)._replace(method=self.method)
         y = self.checked(y)
-        return smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
+        result = smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
+        warn_of_long_steps(self.ssm, self.rule, grid, lambda: result.filtered_mean_at(grid.observed),
+                           result.log_likelihood)
+        return result
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (T,): log p(y_k | y_1:k-1) of the present entries of each observation.
