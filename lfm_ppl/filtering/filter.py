@@ -130,7 +130,7 @@ def filter(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         last = np.asarray(concrete_times[-1], float)
         result = eqx.tree_at(lambda r: r.state.time, result, last)
     warn_of_breakdown(ssm, rule, grid, y, initial, result.log_likelihood)
-    warn_of_long_steps(ssm, rule, grid, result.filtered_mean, result.log_likelihood,
+    warn_of_long_steps(ssm, rule, grid, steps, result.filtered_mean, result.log_likelihood,
                        None if initial is None else initial.mean)
     return result
 

@@ -111,10 +111,6 @@ class SmootherResult(eqx.Module):
         """Return mean (K,) and sd (K,) of a physical state."""
         return self._marginal("state", name, self.state_names, 0)
 
-    def filtered_mean_at(self, intervals: Any) -> jax.Array:
-        """Return the means (T, n) of the joint state after the observations at the ends of intervals of the grid."""
-        return self._trace.filtered.mean[jnp.asarray(intervals)]
-
     def _marginal(self, kind: str, name: str, names: tuple[str, ...], first: int) -> MeanSd:
         checks.one_of(kind, name, names)
         index = first + names.index(name)
@@ -219,8 +215,13 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     warn_single_precision()
     result = _compiled_smooth(ssm, rule, grid, y, iterations, damping, settings)
     warn_of_breakdown(ssm, rule, grid, y, None, result.log_likelihood, settings, result.converged)
-    warn_of_long_steps(ssm, rule, grid, lambda: result.filtered_mean_at(grid.observed), result.log_likelihood)
+    warn_of_long_steps(ssm, rule, grid, steps, lambda: filtered_mean(result, grid), result.log_likelihood)
     return result
+
+
+def filtered_mean(result: SmootherResult, grid: TimeGrid) -> jax.Array:
+    """Return the means (T, n) of the joint state given the observations so far, at the observations of the grid."""
+    return result._trace.filtered.mean[jnp.asarray(grid.observed)]
 
 
 def smooth_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int, damping: float,

@@ -162,8 +162,8 @@ def explicit_steps(ssm: StateSpaceModel, grid: TimeGrid, filtered_mean: jax.Arra
 _compiled_explicit_steps = eqx.filter_jit(explicit_steps)
 
 
-def warn_of_long_steps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, filtered_mean: Any, log_likelihood: Any,
-                       initial_mean: Any = None) -> None:
+def warn_of_long_steps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, steps: int, filtered_mean: Any,
+                       log_likelihood: Any, initial_mean: Any = None) -> None:
     """Warn where a step is too long for a fast decay; nothing happens in compiled code.
 
     Where a log likelihood is not finite, `lfm_ppl.filtering.breakdown.warn_of_breakdown` speaks.
@@ -172,6 +172,7 @@ def warn_of_long_steps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, filtere
         ssm: the model.
         rule: the linearisation rule.
         grid: the time grid.
+        steps: integration steps between two consecutive times.
         filtered_mean: (T, n), of the joint state at the observations; or a function that returns it.
         log_likelihood: result of the filter, of any shape.
         initial_mean: (n,), at the initial time; None: the model's.
@@ -183,7 +184,7 @@ def warn_of_long_steps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, filtere
     mean = filtered_mean() if callable(filtered_mean) else filtered_mean
     long = long_step(_compiled_explicit_steps(ssm, grid, mean, initial_mean))
     if long is not None:
-        checks.warn(long_step_message(long, ssm.model.state_names, grid.steps), FilterWarning)
+        checks.warn(long_step_message(long, ssm.model.state_names, steps), FilterWarning)
 
 
 def is_slow(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> bool:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.filtering.dynamics import is_nonlinear_in_forces_only
 from lfm_ppl.filtering.stiffness import ExplicitSteps, has_explicit_steps, is_slow, long_step, long_step_message
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.map_draws import map_series
@@ -37,9 +38,10 @@ def long_step_messages(bound: BoundModel, z: np.ndarray, has_method: bool = True
 
 
 def _explicit_steps(bound: BoundModel, z: np.ndarray) -> ExplicitSteps | None:
-    if not isinstance(bound.site.distribution, Panel):
-        likelihood = bound.likelihood(z)
+    example = bound.site.example
+    if not isinstance(bound.site.distribution, Panel) and is_nonlinear_in_forces_only(example.ssm, example.rule):
         # No filter needs to be compiled where the steps cannot be too long.
+        likelihood = bound.likelihood(z)
         if is_slow(likelihood.ssm, likelihood.rule, likelihood.time_grid):
             return None
 

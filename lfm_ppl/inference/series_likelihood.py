@@ -30,7 +30,7 @@ from lfm_ppl.filtering.grid_layout import GridLayout
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_linear, is_observation_nonlinear
-from lfm_ppl.filtering.smoother import SmootherResult, smooth_on
+from lfm_ppl.filtering.smoother import SmootherResult, filtered_mean, smooth_on
 from lfm_ppl.filtering.stiffness import ExplicitSteps, explicit_steps, has_explicit_steps, warn_of_long_steps
 from lfm_ppl.filtering.time_grid import build_time_grid, lay_out_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
@@ -198,7 +198,8 @@ class SeriesLikelihood(dist.Distribution):
         """Filter with this distribution's rule and steps; see `lfm_ppl.filter`. Constraints are ignored."""
         y = self.checked(y)
         result = self._filter(y)
-        warn_of_long_steps(self.ssm, self.rule, self.time_grid, result.filtered_mean, result.log_likelihood)
+        warn_of_long_steps(self.ssm, self.rule, self.time_grid, self.steps, result.filtered_mean,
+                           result.log_likelihood)
         return result
 
     def _filter(self, y: jax.Array) -> FilterResult:
@@ -206,7 +207,8 @@ class SeriesLikelihood(dist.Distribution):
 
     def warn_of_long_steps(self, y: jax.Array, log_likelihood: jax.Array) -> None:
         """Warn where a step is too long for a fast decay, outside of compiled code; y (T, D) is checked."""
-        warn_of_long_steps(self.ssm, self.rule, self.time_grid, lambda: self._filter(y).filtered_mean, log_likelihood)
+        warn_of_long_steps(self.ssm, self.rule, self.time_grid, self.steps, lambda: self._filter(y).filtered_mean,
+                           log_likelihood)
 
     def explicit_steps(self, y: jax.Array) -> ExplicitSteps | None:
         """Return what limits the explicit steps of the filter of ``y`` (T, D); None where there are none."""
@@ -233,8 +235,8 @@ class SeriesLikelihood(dist.Distribution):
                                    tolerance=self.tolerance)._replace(method=self.method)
         y = self.checked(y)
         result = smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
-        warn_of_long_steps(self.ssm, self.rule, grid, lambda: result.filtered_mean_at(grid.observed),
-                           result.log_likelihood)
+        warn_of_long_steps(self.ssm, self.rule, grid, self.steps if steps is None else steps,
+                           lambda: filtered_mean(result, grid), result.log_likelihood)
         return result
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
