@@ -112,8 +112,9 @@ def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float
         if is_exponential:
             # A fast state settles during the interval.
             min_sd_of_step = minimum_sd(dynamics, factor_of_interval, rest_of_span.time(), h, previous.moments)
-            step, (mean_error, covariance_error) = exponential_step(dynamics, rest_of_span, h, previous.moments,
-                                                                    min_sd_of_step)
+            step, step_error = exponential_step(dynamics, rest_of_span, h, previous.moments, min_sd_of_step)
+            assert step_error is not None
+            mean_error, covariance_error = step_error
         else:
             factor = integrating_factor(ssm, dynamics.linear, h)
             step, stage4 = runge_kutta_step(dynamics, factor, rest_of_span, h, previous.moments, min_sd,

@@ -12,9 +12,9 @@ r"""One exponential step of the moments, for stiff dynamics: stable however fast
 4. D has the positive weights of Simpson's rule, (D_start + 2 D_middle) / 3 and (2 D_middle + D_end) / 3.
 5. The filter's own moments at middle and end are predicted with exponentials of lower order, so that the step has order
    three (two in a rate D that varies).
-6. Half of the difference from a step of order two estimates the error. That step interpolates linearly between the
-   start and the end, which is linearised once more about the result. Both steps follow what drives a fast state, so
-   that the difference decreases with its rate; a prediction with constant b would be off by the change of b.
+6. The difference from a step of order two estimates the error. That step takes the linearisation at the middle, and b
+   linear in time between its values at the start and the end for the same state: both steps follow what drives a fast
+   state, so that the difference decreases with its rate. A constant b would be off by the change of b.
 
 Source: Blanes and Moan (2006), Applied Numerical Mathematics 56(12), for the integrator; Hochbruck and Ostermann
 (2010), Acta Numerica 19, for exponential integrators of stiff problems.
@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.dynamics import Dynamics, covariance_of, linearize_drift
+from lfm_ppl.filtering.dynamics import Dynamics, covariance_of, is_autonomous, linearize_drift
 from lfm_ppl.filtering.moments import Moments, Prediction, compose, matvec, transform
 from lfm_ppl.filtering.transition import feedback
 from lfm_ppl.forces.discretise import discretise
@@ -66,13 +66,12 @@ _SECOND_HALF = LinearSDE(*np.array([[-2, 8, 6], [-1, 8, 5], [0, -12, 12], [0, 8,
 # The first factor of the integrator does not lead to the middle; the average over the first half does.
 _TO_MIDDLE = LinearSDE(*np.array([[5, 8, -1], [5, 8, -1], [-12, 12, 0], [6, 6, 0]]) / 12)
 
-# Linear interpolation between start and end.
-_LINEAR = LinearSDE(*np.array([[6, 0, 6], [6, 0, 6], [-12, 0, 12], [6, 0, 6]]) / 12)
-
 
 def exponential_step(dynamics: Dynamics, span: Span, h: jax.Array, moments: Moments, min_sd: jax.Array,
-                     about: Moments | None = None) -> tuple[Prediction, Moments]:
+                     about: Moments | None = None) -> tuple[Prediction, Moments | None]:
     """Predict over one step of length ``h``, and return the estimated error of the moments at its end, too.
+
+    There is no estimate about given moments.
 
     Args:
         dynamics: the model and the rule.
@@ -93,16 +92,22 @@ def exponential_step(dynamics: Dynamics, span: Span, h: jax.Array, moments: Mome
         nodes = [linearize_at(node, jax.tree.map(lambda a, node=node: a[node], about)) for node in range(3)]
     else:
         start = linearize_at(0, moments)
-        middle = linearize_at(1, predict(_flow(start, 0.5 * h)).moments)
-        end = linearize_at(2, predict(_flow(middle, h)).moments)
+        midpoint = predict(_flow(start, 0.5 * h)).moments
+        middle = linearize_at(1, midpoint)
+        second_order = predict(_flow(middle, h)).moments
+        end = linearize_at(2, second_order)
+        if not is_autonomous(dynamics.ssm):
+            # XLA removes this where the error is not used.
+            deviation = midpoint.mean - moments.mean
+            offsets = [matvec(sde.feedback - middle.feedback, deviation) + sde.offset
+                       for sde in (linearize_at(0, midpoint), linearize_at(2, midpoint))]
+            driven = middle._replace(offset=0.5 * (offsets[0] + offsets[1]), change=offsets[1] - offsets[0])
+            second_order = predict(_flow(driven, h)).moments
         nodes = [start, linearize_at(1, predict(_flow(_combine(_TO_MIDDLE, start, middle, end), 0.5 * h)).moments), end]
     first, second = (_flow(_combine(weights, *nodes), 0.5 * h) for weights in (_FIRST_HALF, _SECOND_HALF))
     offset = matvec(second.phi, first.offset) + second.offset
     step = predict(_Flow(offset, *compose(first[1:], second[1:])))
-    # XLA removes this where the error is not used.
-    linear = _combine(_LINEAR, nodes[0], nodes[1], linearize_at(2, step.moments))
-    second_order = predict(_flow(linear, h)).moments
-    return step, jax.tree.map(lambda a, b: 0.5 * (a - b), step.moments, second_order)
+    return step, None if about is not None else jax.tree.map(jnp.subtract, step.moments, second_order)
 
 
 def _linear_sde(dynamics: Dynamics, t: jax.Array, origin: jax.Array, point: Moments, min_sd: jax.Array) -> LinearSDE:
