@@ -6,9 +6,9 @@ the rest explicitly. Two limits follow.
 1. The rest, with the Jacobian K: an eigenvalue lambda of K that does not grow must satisfy abs(lambda) h < 2.5, or the
    step leaves the region of stability and amplifies what should decay. (A positive real part is growth, and no
    instability: it counts as zero.)
-2. The linear part: what the rest of the drift, or noise, feeds into a decay of rate lambda settles within 1 / lambda.
-   The weights of the step, those of Simpson's rule, resolve that to 0.2% up to lambda h = 1.5; beyond, the state
-   settles at up to lambda h / 6 times its right value.
+2. The linear part: the rest of the drift, or noise, drives a decay of rate lambda, which settles within 1 / lambda. The
+   step integrates this by Simpson's rule, with an error of 0.2% for lambda h = 1.5. A state with a much larger lambda h
+   settles at lambda h / 6 times its right value.
 
 `explicit_steps` follows the mean through each interval from the filtered mean at its start, by linearly implicit Euler
 steps, which are stable, and records K where it is largest: a decay that saturates may be slow at all rows and fast
@@ -259,8 +259,8 @@ def _linear_products(steps: ExplicitSteps) -> np.ndarray:
 
 def _participations(matrix: np.ndarray) -> np.ndarray:
     """Return the participation (M, M) of each state (row) in each mode (column) of a matrix, in any units."""
-    _, left, right = scipy.linalg.eig(matrix, left=True, right=True)
-    products = np.abs(left.conj() * right)
+    _, left_vectors, right_vectors = scipy.linalg.eig(matrix, left=True, right=True)
+    products = np.abs(left_vectors.conj() * right_vectors)
     return products / np.maximum(products.sum(axis=0), 1e-300)
 
 

@@ -156,9 +156,9 @@ class SimulationProgram:
         ssm, size = self.ssm, self.ssm.physical_dim
         if not size or checks.traced((ssm, self.breakpoints)) or _has_traced_functions(ssm):
             return self
-        ends = np.unique(np.append(times, start))
+        row_times = np.unique(np.append(times, start))
         limit = LONGEST_PRODUCT if ssm.model.process_noise is None else _LONGEST_WITH_NOISE
-        if self._pilot_rate(times, start) * float(np.max(np.diff(ends), initial=0.0)) / self.steps <= limit:
+        if self._pilot_rate(times, start) * float(np.max(np.diff(row_times), initial=0.0)) / self.steps <= limit:
             return self
         # The explicit pilot path may have diverged; a stiff one does not.
         stiff = replace(self, is_stiff=True)

@@ -24,14 +24,14 @@ def divide_steps(times: Any, start: Any, steps: int, breakpoints: Any, longest_s
 
     Arguments as in `simulate_on`, times and start concrete.
     """
-    ends = np.unique(np.append(np.asarray(times, float), float(start)))
-    gaps = np.diff(ends)
+    row_times = np.unique(np.append(np.asarray(times, float), float(start)))
+    gaps = np.diff(row_times)
     is_long = gaps > longest_step * steps * (1 + 1e-9)
     if not is_long.any():
         return breakpoints
     spacing = max(longest_step, float(gaps[is_long].sum()) / _MOST_NODES)
     nodes = [np.linspace(first, first + gap, int(np.ceil(gap / spacing)) + 1)[1:-1]
-             for first, gap in zip(ends[:-1][is_long], gaps[is_long], strict=True)]
+             for first, gap in zip(row_times[:-1][is_long], gaps[is_long], strict=True)]
     return jnp.concatenate([jnp.asarray(breakpoints, float), *nodes])
 
 
