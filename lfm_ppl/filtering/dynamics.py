@@ -25,7 +25,7 @@ from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partia
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.model.state_space import StateSpaceModel
-from lfm_ppl.utils.linalg import congruence, diagonal, matmul, outer_square
+from lfm_ppl.utils.linalg import congruence, diagonal, fastest_rate, matmul, outer_square
 
 MINIMUM_SD = "lfm_ppl: minimum standard deviation"
 """Name under which `minimum_sd` is stored for the derivative of an interval instead of being computed again."""
@@ -81,19 +81,6 @@ def minimum_sd(dynamics: Dynamics, factor: IntegratingFactor, t: jax.Array, h: j
         scale = (jnp.abs(w) + jnp.concatenate([change, outputs]))[jnp.asarray(ssm.drift_structure.nonlinear, int)]
     scale = jnp.where(jnp.isfinite(scale), scale, 0.0)
     return checkpoint_name(jax.lax.stop_gradient(1e-6 * scale + 1e-150), MINIMUM_SD)
-
-
-def fastest_rate(jacobian: jax.Array) -> jax.Array:
-    """Estimate the largest modulus of an eigenvalue of the Jacobian (M, n) in the physical state, |K^8|^(1/8).
-
-    The units of the states matter little: a ratio of 1,000 between them makes it 2.4 times as large at most.
-    """
-    size = jacobian.shape[0]
-    largest = jnp.maximum(jnp.max(jnp.abs(jacobian[:, :size]), initial=0.0), 1e-300)
-    power = jacobian[:, :size] / largest
-    for _ in range(3):
-        power = matmul(power, power)
-    return largest * jnp.maximum(jnp.max(jnp.abs(power), initial=0.0), 1e-100) ** 0.125
 
 
 def linearize(ssm: StateSpaceModel, rule: Rule, function: Function, structure: InputStructure, jacobian: jax.Array,

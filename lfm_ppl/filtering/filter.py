@@ -25,6 +25,7 @@ from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import at_intervals, filter_problem
+from lfm_ppl.filtering.stiffness import warn_of_long_steps
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.rule import Rule
@@ -102,7 +103,7 @@ def filter(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
 
     Warns:
         FilterWarning: outside of compiled code, where a log likelihood is -inf or not finite: which row and step breaks
-            down, and how.
+            down, and how; or where an explicit step is too long for a fast decay: which state and row, and the remedy.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -133,6 +134,8 @@ def filter(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         last = np.asarray(concrete_times[-1], float)
         result = eqx.tree_at(lambda r: r.state.time, result, last)
     warn_of_breakdown(ssm, rule, grid, y, initial, result.log_likelihood)
+    warn_of_long_steps(ssm, rule, grid, steps, result.filtered_mean, result.log_likelihood,
+                       None if initial is None else initial.mean)
     return result
 
 

@@ -32,6 +32,7 @@ from lfm_ppl.filtering.iterated import number_of_iterations, posterior_linearisa
 from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
 from lfm_ppl.filtering.sample import sample_errors
+from lfm_ppl.filtering.stiffness import warn_of_long_steps
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.rule import Rule
@@ -222,7 +223,13 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     warn_of_breakdown(ssm, rule, grid, y, None, result.log_likelihood, settings, result.converged)
     if not isinstance(model.observation, ObservationFamily):
         warn_of_iterations(result.change, result.log_likelihood_change)
+    warn_of_long_steps(ssm, rule, grid, steps, lambda: filtered_mean(result, grid), result.log_likelihood)
     return result
+
+
+def filtered_mean(result: SmootherResult, grid: TimeGrid) -> jax.Array:
+    """Return the means (T, n) of the joint state given the observations so far, at the observations of the grid."""
+    return result._trace.filtered.mean[jnp.asarray(grid.observed)]
 
 
 def smooth_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int, damping: float,

@@ -13,6 +13,7 @@ Source: Hartikainen et al. (2012), section 4; Singer (2011), AStA 95.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -24,7 +25,7 @@ from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.evidence import Evidence, evidence
 from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
-from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA
+from lfm_ppl.filtering.intervals import EXPONENTIAL, METHODS, RUNGE_KUTTA
 from lfm_ppl.filtering.iterated import number_of_iterations
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
@@ -32,7 +33,8 @@ from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
-from lfm_ppl.model.simulate import input_breakpoints, simulate_on
+from lfm_ppl.model.simulate import SimulationProgram, input_breakpoints
+from lfm_ppl.model.stiff_simulation import divide_steps
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
 
@@ -97,7 +99,7 @@ class MarginalLikelihood(SeriesLikelihood):
     Warns:
         FilterWarning: outside of compiled code, where a log density is -inf or sites do not converge: where and how;
             where the last iteration changes a smoothed mean by more than one standard deviation, or the log density by
-            more than 0.5.
+            more than 0.5; where an explicit step is too long for a fast decay: which state and row, and the remedy.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -198,6 +200,7 @@ class MarginalLikelihood(SeriesLikelihood):
             log_likelihood = self._guarded_terms(y, lambda terms: terms.sum(keepdims=True))[0]
         warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood, self.site_settings,
                           has_converged)
+        self.warn_of_long_steps(y, log_likelihood)
         return log_likelihood
 
     def evidence(self, y: jax.Array) -> Evidence:
@@ -217,13 +220,24 @@ class MarginalLikelihood(SeriesLikelihood):
         return jnp.stack([result.log_evidence, has_converged.astype(result.log_evidence.dtype)])
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
-        """Simulate the real model: (*sample_shape, T, D)."""
-        start = jnp.asarray(self.time_grid.initial_time, float)
-        breakpoints = input_breakpoints(self.model, checks.concrete(self.times), self.time_grid.initial_time)
+        """Simulate the real model: (*sample_shape, T, D).
+
+        No step is longer than a fifth of the longest step of the filter. Outside of compiled code, fast rates divide
+        the steps further, as in `lfm_ppl.simulate`.
+        """
+        initial_time, times = self.time_grid.initial_time, checks.concrete(self.times)
+        steps, breakpoints = SIMULATION_STEPS * self.steps, input_breakpoints(self.model, times, initial_time)
+        program = SimulationProgram(self.ssm, steps, breakpoints, self.method == EXPONENTIAL)
+        lengths = checks.concrete(self.time_grid.intervals.length)
+        if times is not None and lengths is not None and not checks.traced(initial_time):
+            if self.tolerance is None:
+                longest = float(lengths.max(initial=0.0)) / self.time_grid.steps / SIMULATION_STEPS
+                program = replace(program, breakpoints=divide_steps(times, initial_time, steps, breakpoints, longest))
+            program = program.resolved(times, float(initial_time))
 
         def simulate(key: jax.Array) -> jax.Array:
-            return simulate_on(self.ssm, key, jnp.asarray(self.times, float), start, SIMULATION_STEPS * self.steps,
-                               breakpoints).y
+            simulation, _ = program.run(key, jnp.asarray(self.times, float), jnp.asarray(initial_time, float))
+            return simulation.y
 
         return repeat_draw(simulate, key, sample_shape)
 

@@ -2,7 +2,8 @@
 
 1. Where a path is simulated beyond the data, or known inputs of a linear model are integrated there, rows after the
    data are at most as far apart as the data usually are.
-2. The number of steps of a row follows from the longest row, compared with the distance of two observations.
+2. The number of steps of a row follows from the longest row: none is longer than a step between the observations
+   there, and than the longest step of the fit, divided as simulations divide steps.
 3. Series of a panel that have their own times have rows of their own, padded to a common number.
 """
 
@@ -14,12 +15,16 @@ from typing import Any
 
 import numpy as np
 
+from lfm_ppl.filtering.division import longest_step
 from lfm_ppl.filtering.time_grid import LONGEST_FORECAST, build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils import checks
+
+_MOST_STEPS_OF_ROW = 100
+"""Largest number of steps of a row, as a multiple of those between two observations."""
 
 _ADAPTIVE_FACTOR = 5
 """Largest number of adaptive steps, as a multiple of the number of equal steps."""
@@ -91,10 +96,14 @@ def _plan_of(series: SeriesLikelihood, times: np.ndarray, requested_times: np.nd
     base = series.steps
     if series.max_step is not None:
         base = max(base, int(np.ceil(gaps.max(initial=0.0) / series.max_step * (1 - 1e-12))))
-    fine = SIMULATION_STEPS * base * (1 if series.tolerance is None else _ADAPTIVE_FACTOR)
+    factor = SIMULATION_STEPS * (1 if series.tolerance is None else _ADAPTIVE_FACTOR)
+    fine = factor * base
+    longest = _longest_step(series, times) / factor
     rows = np.arange(times.shape[-1])
     if requested_times is None:
-        return PathPlan(None, rows, rows, fine)
+        steps = max(_steps_per_interval(series.ssm, row, row, fine, since, longest)
+                    for row in np.atleast_2d(times)) if simulated else fine
+        return PathPlan(None, rows, rows, steps)
     beyond = np.array([])
     needs_steps = simulated or not series.ssm.mean_invariant or len(series.ssms) > 1
     if needs_steps and requested_times.max() > times[-1] and (gaps > 0).any():
@@ -102,7 +111,7 @@ def _plan_of(series: SeriesLikelihood, times: np.ndarray, requested_times: np.nd
         count = min(int(np.ceil((requested_times.max() - times[-1]) / gap * (1 - 1e-12))), LONGEST_FORECAST)
         beyond = np.linspace(times[-1], requested_times.max(), count + 1)[1:-1]
     path_times = np.concatenate([requested_times, beyond])
-    steps = _steps_per_interval(series.ssm, times, path_times, fine, since) if simulated else fine
+    steps = _steps_per_interval(series.ssm, times, path_times, fine, since, longest) if simulated else fine
     first = len(path_times)
     return PathPlan(np.concatenate([path_times, times]), np.arange(len(requested_times)), first + rows, steps)
 
@@ -122,8 +131,11 @@ def first_simulated_times(bound: BoundModel) -> np.ndarray:
 
 
 def _steps_per_interval(ssm: StateSpaceModel, times: Any, requested_times: Any, steps: int,
-                        since: float = -np.inf) -> int:
-    """Return the number of steps of rows after ``since`` with which no step is longer than between two observations."""
+                        since: float = -np.inf, longest: float = np.inf) -> int:
+    """Return the number of steps of rows after ``since`` with which no step is longer than between two observations.
+
+    Nor is it longer than ``longest``, up to a number of steps.
+    """
     concrete_times = checks.concrete(times)
     if requested_times is None or concrete_times is None:
         return steps
@@ -140,5 +152,16 @@ def _steps_per_interval(ssm: StateSpaceModel, times: Any, requested_times: Any, 
     # A row after the last observation is compared with the usual distance between two observations.
     index = np.searchsorted(marks, end - 1e-12 * np.abs(end), side="left") - 1
     gap = np.where(index < len(gaps), gaps[np.clip(index, 0, len(gaps) - 1)], np.median(gaps))
-    share = (rows.length / gap)[end > first].max(initial=0.0)
-    return max(1, int(np.ceil(steps * min(float(share), 1.0) - 1e-9)))
+    needed = (rows.length / np.minimum(gap / steps, longest))[end > first].max(initial=0.0)
+    return max(1, int(np.ceil(min(float(needed), _MOST_STEPS_OF_ROW * steps) - 1e-9)))
+
+
+def _longest_step(series: SeriesLikelihood, times: np.ndarray) -> float:
+    """Return the longest step of the fit of a series."""
+    if series.max_step is not None:
+        return series.max_step
+    origin = series.model.initial_time
+    first = np.atleast_2d(times)[0]
+    start = first[0] if origin is None or checks.traced(origin) else float(origin)
+    longest = longest_step(series.ssm, first, start, series.steps)
+    return np.inf if longest is None else longest

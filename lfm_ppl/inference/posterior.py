@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.grid_layout import GridLayout, padded_size
+from lfm_ppl.filtering.intervals import EXPONENTIAL
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
@@ -27,8 +28,9 @@ from lfm_ppl.inference.path_plan import PathPlan, first_simulated_times, has_for
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
-from lfm_ppl.model.simulate import input_breakpoints, simulate_missing_states
+from lfm_ppl.model.simulate import LONGEST_PRODUCT, input_breakpoints, simulate_missing_states
 from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.model.stiff_simulation import warn_of_infinite_states
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
 from lfm_ppl.utils.linalg import semidefinite_root
@@ -40,6 +42,9 @@ _FILTERS = 4
 
 _POINTS = 8
 """Points of the distribution of state and forces, for the bands of non-linear functions of them."""
+
+_PRODUCT = "largest product of step and rate"
+"""Name of this number among the results of simulated paths."""
 
 LOG_PRIOR = "log prior of "
 """Start of the names of the log prior densities among the scores."""
@@ -78,7 +83,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     """Draw one trajectory for each draw of the parameters, given the data, and new data along it.
 
     Up to the last observation the path is a draw of the smoother. After it, non-linear dynamics are simulated: see
-    `lfm_ppl.forecast` for the reason.
+    `lfm_ppl.forecast` for the reason. Where a step of that is too long, the paths are simulated once more with
+    exponential steps.
 
     Args:
         key: a JAX random key.
@@ -106,6 +112,34 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     at = None if at is None else np.asarray(at, float)
     if at is not None and np.array_equal(at, bound.times):
         at = None
+    is_stiff = bound.site.example.method == EXPONENTIAL
+    settings = particles, particle_steps
+    paths = _paths(key, bound, draws, at, settings, is_stiff, report=report, store=store)
+    if _PRODUCT not in paths:
+        return paths
+    if not is_stiff and np.max(paths[_PRODUCT], initial=0.0) > LONGEST_PRODUCT:
+        # Not stored: the batches of the store are those of the explicit steps.
+        paths = _paths(key, bound, draws, at, settings, True, report=report, store=None)
+    del paths[_PRODUCT]
+    warn_of_infinite_states(paths["state"], bound.times if at is None else at,
+                            bound.site.example.ssm.model.state_names)
+    return paths
+
+
+def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: np.ndarray | None,
+           settings: tuple[ParticleSettings | None, int | None], is_stiff: bool, **options: Any) -> dict[str, Any]:
+    """Return the results of `trajectories`, and of simulated paths the largest product of a step and the fastest rate.
+
+    Args:
+        key: a JAX random key.
+        bound: the model and its data.
+        draws: as in `trajectories`.
+        at: as in `trajectories`.
+        settings: ``particles`` and ``particle_steps`` of `trajectories`.
+        is_stiff: whether simulated steps that are longer than the fastest time constant are exponential.
+        **options: ``report`` and ``store`` of `map_draws`.
+    """
+    particles, particle_steps = settings
     example = bound.site.example
     is_forecast = None
     if particles is None and example.has_gaussian_state and example.ssm.drift_structure.nonlinear:
@@ -138,9 +172,11 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
             is_smoothed = jnp.ones((len(when), 1), bool)
             if is_forecast:
                 is_smoothed = (when <= _last_observed(y, when, plan))[:, None]
-                states = _simulate_forecast(distribution, states, when, is_smoothed[:, 0], plan, keys["forecast"])
+                states, product = _simulate_forecast(distribution, states, when, is_smoothed[:, 0], plan,
+                                                     keys["forecast"], is_stiff)
+                results[_PRODUCT] = product
             w = jax.vmap(ssm.inputs)(states, when)
-            results = _moments(ssm, smoothed, w, is_smoothed, plan)
+            results |= _moments(ssm, smoothed, w, is_smoothed, plan)
             gaussian = not (isinstance(ssm.model.observation, ObservationFamily) or noise_of_rows(distribution))
             results |= _points(ssm, smoothed, w, when, is_smoothed, plan, keys["points"], gaussian)
             results |= {"log_likelihood": smoothed.log_likelihood.sum()}
@@ -191,8 +227,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         assert isinstance(distribution, SeriesLikelihood)
         return draw_series(distribution, bound.data(y), key, times, None if inputs is None else inputs.value[1])
 
-    options: dict[str, Any] = {"report": report, "store": store}
-    name: tuple = ("trajectories", particles, particle_steps, is_forecast)
+    name: tuple = ("trajectories", particles, particle_steps, is_forecast, is_stiff)
     if is_shared:
         # Where the path is simulated the smoother stays at the last row of the data, at no cost.
         reached = plan.times if plan.times is None or not is_forecast else np.minimum(plan.times, bound.times.max())
@@ -200,7 +235,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         name = (*name, len(plan.requested), plan.rows, at is None, plan.steps if is_forecast else None)
         paths = map_draws(bound, name, SharedFunction(shared_per_draw, (plan.times, inputs)), draws, key,
                           rows=plan.rows, **options)
-        return {name: value if name in ("y", "log_likelihood") else value[..., :count, :]
+        return {name: value if name in ("y", "log_likelihood", _PRODUCT) else value[..., :count, :]
                 for name, value in paths.items()}
     rows = plan.rows * (1 if particles is None else particles.particles)
     return map_draws(bound, (*name, signature(at)), per_draw, draws, key, rows=rows, **options)
@@ -230,16 +265,19 @@ def _last_observed(y: jax.Array, when: jax.Array, plan: PathPlan) -> jax.Array:
 
 
 def _simulate_forecast(distribution: SeriesLikelihood, states: jax.Array, when: jax.Array, is_smoothed: jax.Array,
-                       plan: PathPlan, key: jax.Array) -> jax.Array:
-    """Return the joint states (L, n), simulated after the last smoothed one; ``is_smoothed`` is (L,)."""
+                       plan: PathPlan, key: jax.Array, is_stiff: bool) -> tuple[jax.Array, jax.Array]:
+    """Return the joint states (L, n), simulated after the last smoothed one; see `simulate_missing_states`.
+
+    ``is_smoothed`` is (L,).
+    """
     order = jnp.arange(plan.rows) if plan.times is None else jnp.argsort(when, stable=True)
     # Breakpoints before the first time or after the last one change nothing.
     layout = distribution.layout
     breakpoints = (input_breakpoints(distribution.model, None, None) if layout is None
                    else layout.breakpoints(distribution.model.input_reads(0.0, 1.0)))
-    path = simulate_missing_states(distribution.ssm, key, states[order], when[order], is_smoothed[order], plan.steps,
-                                   breakpoints)
-    return jnp.zeros_like(states).at[order].set(path)
+    path, product = simulate_missing_states(distribution.ssm, key, states[order], when[order], is_smoothed[order],
+                                            plan.steps, breakpoints, is_stiff)
+    return jnp.zeros_like(states).at[order].set(path), product
 
 
 def _moments(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, is_smoothed: jax.Array,

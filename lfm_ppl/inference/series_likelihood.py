@@ -30,10 +30,12 @@ from lfm_ppl.filtering.grid_layout import GridLayout
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.iterated import posterior_linearisation
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_affine
-from lfm_ppl.filtering.smoother import SmootherResult, smooth_on
+from lfm_ppl.filtering.smoother import SmootherResult, filtered_mean, smooth_on
+from lfm_ppl.filtering.stiffness import ExplicitSteps, explicit_steps, has_explicit_steps, warn_of_long_steps
 from lfm_ppl.filtering.time_grid import build_time_grid, lay_out_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.events import EventTable, event_table
 from lfm_ppl.model.inputs import InputRead
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -199,7 +201,26 @@ class SeriesLikelihood(dist.Distribution):
         It is a single pass, also where `log_prob` and `smooth` iterate posterior linearisation.
         """
         y = self.checked(y)
+        result = self._filter(y)
+        warn_of_long_steps(self.ssm, self.rule, self.time_grid, self.steps, result.filtered_mean,
+                           result.log_likelihood)
+        return result
+
+    def _filter(self, y: jax.Array) -> FilterResult:
         return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
+
+    def warn_of_long_steps(self, y: jax.Array, log_likelihood: jax.Array) -> None:
+        """Warn where a step is too long for a fast decay, outside of compiled code; y (T, D) is checked."""
+        warn_of_long_steps(self.ssm, self.rule, self.time_grid, self.steps, lambda: self._filter(y).filtered_mean,
+                           log_likelihood)
+
+    def explicit_steps(self, y: jax.Array) -> ExplicitSteps | None:
+        """Return what limits the explicit steps of the filter of ``y`` (T, D); None where there are none."""
+        if not has_explicit_steps(self.ssm, self.time_grid):
+            return None
+        # Linearised at the mean: the rates need no more, and this compiles fastest.
+        result = filter_on(self.ssm, Taylor(), self.time_grid, y, jnp.asarray(self.times, float))
+        return explicit_steps(self.ssm, self.time_grid, result.filtered_mean)
 
     def smooth(self, y: Any, at: Any = None, steps: int | None = None) -> SmootherResult:
         """Smooth with this distribution's settings, or with other ``steps``; see `lfm_ppl.smooth`.
@@ -222,6 +243,8 @@ class SeriesLikelihood(dist.Distribution):
         result = smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
         if not self.is_family:
             warn_of_iterations(result.change, result.log_likelihood_change)
+        warn_of_long_steps(self.ssm, self.rule, grid, self.steps if steps is None else steps,
+                           lambda: filtered_mean(result, grid), result.log_likelihood)
         return result
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:

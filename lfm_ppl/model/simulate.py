@@ -6,16 +6,22 @@
 3. Each step draws the forces at its end from their exact transition and process noise.
 4. The physical state follows by the classical Runge-Kutta method, with the forces linear in time over the step.
 5. Process noise enters with the dispersion at the start of the step (Ito), spread evenly over the step.
+   A stiff model takes, where a step is longer than the fastest time constant, the exact solution of the SDE that is
+   linearised at the start of the step (`exponential_change`).
 6. At the end of a step that crosses a jump of a force, draw the jump. Events end intervals, like breakpoints.
 7. Draw the observations at the rows from the noise or the observation family.
+8. `SimulationProgram.resolved` bounds the steps: a pilot path, of a fixed key, finds the fastest rate. Where a step
+   would be too long for it, further breakpoints divide the time between rows, whatever rows are requested.
 
-Source: Kloeden and Platen (1992), Numerical Solution of Stochastic Differential Equations, section 9.1.
+Source: Kloeden and Platen (1992), Numerical Solution of Stochastic Differential Equations, section 9.1; Jimenez, Shoji
+and Ozaki (1999), Journal of Statistical Physics 94, for the linearised SDE.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -27,9 +33,19 @@ from lfm_ppl.model.inputs import breakpoints_within
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.model.state_space import Span, StateSpaceModel, check_times, state_space
+from lfm_ppl.model.stiff_simulation import divide_steps, exponential_change, warn_of_infinite_states
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import matmul, semidefinite_root
+from lfm_ppl.utils.linalg import fastest_rate, matmul, semidefinite_root
 from lfm_ppl.utils.random_keys import split_by_name
+
+LONGEST_PRODUCT = 1.0
+"""Largest product of step and fastest rate of an explicit step.
+
+It is stable up to 2.8, but may stop at fixed points that the model does not have.
+"""
+
+_LONGEST_WITH_NOISE = 0.25
+"""The same with process noise, whose even spread over a step biases variances."""
 
 
 class Simulation(NamedTuple):
@@ -55,17 +71,24 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
     Runge-Kutta method along this path. Process noise enters each step with the dispersion at the start of the step
     (Ito), spread evenly over the step: the strong order is 1 for additive noise and 1/2 otherwise.
 
+    Outside of compiled code, where a step would be longer than the time constant of the fastest decay (a quarter of it
+    with process noise), it is divided, so that paths between sparse times have the law of those at dense times. What is
+    too stiff for that takes exponential steps.
+
     Args:
         key: a JAX random key.
         model: the latent force model.
         times: (T,), non-decreasing; equal times have the same state and independent observations.
-        steps: integration steps between two consecutive times.
+        steps: integration steps between two consecutive times, at least.
 
     Returns:
         Times, state, forces and observations.
 
     Raises:
         ValueError: unsorted times, times before the initial time, non-positive steps.
+
+    Warns:
+        UserWarning: outside of compiled code, where a state is not finite.
 
     Example:
         >>> import jax, jax.numpy as jnp, lfm_ppl as lfm
@@ -81,20 +104,82 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
     checks.positive_integer("steps", steps)
     ssm = state_space(model)
     concrete_times = check_times(times, model.initial_time)
+    first = None
     if concrete_times is not None and not checks.traced(model.initial_time):
-        first = concrete_times[0] if model.initial_time is None else model.initial_time
-        model.check_inputs(float(first), float(concrete_times[-1]))
-        check_start(event_table(model.events).times, float(first))
+        first = float(concrete_times[0] if model.initial_time is None else model.initial_time)
+        model.check_inputs(first, float(concrete_times[-1]))
+        check_start(event_table(model.events).times, first)
     model.check_at(times[0] if model.initial_time is None else model.initial_time, np.shape(times)[0])
     times = jnp.asarray(times, float)
     start = times[0] if model.initial_time is None else jnp.asarray(model.initial_time, float)
-    breakpoints = input_breakpoints(model, concrete_times, start)
+    breakpoints = input_breakpoints(model, concrete_times, start if first is None else first)
+    program = SimulationProgram(ssm, steps, breakpoints)
+    if concrete_times is not None and first is not None:
+        program = program.resolved(concrete_times, first)
+    if checks.traced((model, times, key, breakpoints)):
+        return program.run(key, times, start)[0]
+    simulation, _ = program.compiled(key, times, start)
+    warn_of_infinite_states(simulation.state, times, model.state_names)
+    return simulation
 
-    def run(key: jax.Array, times: jax.Array, start: jax.Array) -> Simulation:
-        return simulate_on(ssm, key, times, start, steps, breakpoints)
 
-    is_traced = checks.traced((model, times, key, breakpoints))
-    return (run if is_traced else jax.jit(run))(key, times, start)
+@dataclass(frozen=True, eq=False)
+class SimulationProgram:
+    """A simulation as a function of the key, the times and the initial time.
+
+    Attributes:
+        ssm: the state-space model.
+        steps: integration steps between two consecutive times.
+        breakpoints: (K,), see `input_breakpoints` and `divide_steps`.
+        is_stiff: whether steps that are longer than the fastest time constant are exponential.
+    """
+
+    ssm: StateSpaceModel
+    steps: int
+    breakpoints: Any = ()
+    is_stiff: bool = False
+
+    def run(self, key: jax.Array, times: jax.Array, start: jax.Array) -> tuple[Simulation, jax.Array]:
+        """Return the simulation, and the fastest rate along its path."""
+        return simulate_on(self.ssm, key, times, start, self.steps, self.breakpoints, self.is_stiff)
+
+    @functools.cached_property
+    def compiled(self) -> Callable[..., tuple[Simulation, jax.Array]]:
+        """`run`, compiled."""
+        return jax.jit(self.run)
+
+    def resolved(self, times: np.ndarray, start: float) -> SimulationProgram:
+        """Return the program with breakpoints between which its steps resolve the fastest rate.
+
+        The rate is that of a pilot path with a fixed key, so that the steps do not depend on the simulated path. The
+        program is unchanged where the model holds traced values.
+        """
+        ssm, size = self.ssm, self.ssm.physical_dim
+        if not size or checks.traced((ssm, self.breakpoints)) or _has_traced_functions(ssm):
+            return self
+        row_times = np.unique(np.append(times, start))
+        limit = LONGEST_PRODUCT if ssm.model.process_noise is None else _LONGEST_WITH_NOISE
+        if self._pilot_rate(times, start) * float(np.max(np.diff(row_times), initial=0.0)) / self.steps <= limit:
+            return self
+        # The explicit pilot path may have diverged; a stiff one does not.
+        stiff = replace(self, is_stiff=True)
+        longest = limit / max(stiff._pilot_rate(times, start), 1e-300)
+        return replace(stiff, breakpoints=divide_steps(times, start, self.steps, self.breakpoints, longest))
+
+    def _pilot_rate(self, times: np.ndarray, start: float) -> float:
+        with jax.ensure_compile_time_eval():  # the key of the simulation may be traced
+            rate = self.compiled(jax.random.key(0), jnp.asarray(times, float), jnp.asarray(start, float))[1]
+            return float(jnp.where(jnp.isfinite(rate), rate, jnp.inf))
+
+
+def _has_traced_functions(ssm: StateSpaceModel) -> bool:
+    """Return whether the functions of a model close over traced values."""
+    def functions(w: jax.Array, t: jax.Array, key: jax.Array) -> Any:
+        return ssm.drift(w, t), ssm.dispersion(w, t), noisy_observation(ssm, w, t, key, 0)
+
+    with jax.ensure_compile_time_eval():
+        arguments = jnp.zeros(ssm.input_dim), jnp.zeros(()), jax.random.key(0)
+    return checks.traced(jax.make_jaxpr(functions)(*arguments).consts)
 
 
 def input_breakpoints(model: LatentForceModel, times: Any, start: Any) -> Any:
@@ -166,37 +251,59 @@ def _time_nodes(ssm: StateSpaceModel, start: jax.Array, times: jax.Array, breakp
 
 
 def simulate_on(ssm: StateSpaceModel, key: jax.Array, times: jax.Array, start: jax.Array, steps: int,
-                breakpoints: Any = ()) -> Simulation:
-    """Simulate a state-space model without checks, for compiled code; arguments as in `simulate`.
+                breakpoints: Any = (), is_stiff: bool = False) -> tuple[Simulation, jax.Array]:
+    """Simulate a state-space model without checks, for compiled code; return the fastest rate along the path, too.
 
-    ``breakpoints`` (K,) is the result of `input_breakpoints`.
+    Args:
+        ssm: the state-space model.
+        key: a JAX random key.
+        times: (T,).
+        start: initial time.
+        steps: integration steps between two consecutive times.
+        breakpoints: (K,), see `input_breakpoints` and `divide_steps`.
+        is_stiff: whether steps that are longer than the fastest time constant are exponential.
     """
     initial_key, path_key, noise_key = jax.random.split(key, 3)
-    mean, covariance = ssm.initial()
-    first = mean + matmul(semidefinite_root(covariance), jax.random.normal(initial_key, (ssm.state_dim, 1)))[:, 0]
-    nodes = _time_nodes(ssm, start, times, breakpoints, steps)
-    starts = jnp.concatenate([jnp.reshape(start, (1,)), nodes.times[:-1]])
-    integrate = _interval_integrator(ssm, nodes.steps)
-
-    def integrate_to_node(state: jax.Array, interval: tuple) -> tuple[jax.Array, jax.Array]:
-        *arguments, state_map = interval
-        state = integrate(state, *arguments)
-        state = state if state_map is None else state_map.apply(state)
-        return state, state
-
-    keys = jax.random.split(path_key, nodes.times.shape[0])
-    _, states = jax.lax.scan(integrate_to_node, first, (starts, nodes.times, keys, nodes.state_map))
-    states = states[nodes.rows]
+    states, rate = _simulate_states(ssm, initial_key, path_key, times, start, steps, breakpoints, is_stiff)
     inputs = jax.vmap(ssm.inputs)(states, times)
     y = jax.vmap(lambda w, t, k, index: noisy_observation(ssm, w, t, k, index))(
         inputs, times, jax.random.split(noise_key, times.shape[0]), jnp.arange(times.shape[0]))
     size = ssm.physical_dim
     forces = {name: inputs[:, size + index] for index, name in enumerate(ssm.model.force_names)}
-    return Simulation(times, inputs[:, :size], forces, y)
+    return Simulation(times, inputs[:, :size], forces, y), rate
+
+
+class StepExtremes(NamedTuple):
+    """The fastest rate along a path, and its largest product with a step; infinite where the path is not finite."""
+
+    rate: jax.Array
+    product: jax.Array
+
+
+def _simulate_states(ssm: StateSpaceModel, initial_key: jax.Array, path_key: jax.Array, times: jax.Array,
+                     start: jax.Array, steps: int, breakpoints: Any,
+                     is_stiff: bool) -> tuple[jax.Array, jax.Array]:
+    """Simulate the joint states (T, n), and return the fastest rate along the path; arguments as in `simulate_on`."""
+    mean, covariance = ssm.initial()
+    first = mean + matmul(semidefinite_root(covariance), jax.random.normal(initial_key, (ssm.state_dim, 1)))[:, 0]
+    nodes = _time_nodes(ssm, start, times, breakpoints, steps)
+    starts = jnp.concatenate([jnp.reshape(start, (1,)), nodes.times[:-1]])
+    integrate = _interval_integrator(ssm, nodes.steps, is_stiff)
+
+    def integrate_to_node(state: jax.Array, interval: tuple) -> tuple[jax.Array, tuple]:
+        *arguments, state_map = interval
+        state, extremes = integrate(state, *arguments)
+        state = state if state_map is None else state_map.apply(state)
+        return state, (state, extremes.rate)
+
+    keys = jax.random.split(path_key, nodes.times.shape[0])
+    _, (states, rates) = jax.lax.scan(integrate_to_node, first, (starts, nodes.times, keys, nodes.state_map))
+    return states[nodes.rows], jnp.max(rates)
 
 
 def simulate_missing_states(ssm: StateSpaceModel, key: jax.Array, states: jax.Array, times: jax.Array,
-                            is_given: jax.Array, steps: int, breakpoints: Any = ()) -> jax.Array:
+                            is_given: jax.Array, steps: int, breakpoints: Any = (),
+                            is_stiff: bool = False) -> tuple[jax.Array, jax.Array]:
     """Simulate the joint state at times without a given state, from the last given state; for compiled code.
 
     Args:
@@ -207,58 +314,74 @@ def simulate_missing_states(ssm: StateSpaceModel, key: jax.Array, states: jax.Ar
         is_given: (K,), whether the state at a time is given; the first state always is.
         steps: integration steps between two consecutive times.
         breakpoints: breakpoints of known inputs, see `input_breakpoints`.
+        is_stiff: whether steps that are longer than the fastest time constant are exponential.
 
     Returns:
-        (K, n), the given states; every other state is simulated from its predecessor.
+        (K, n), the given states; every other state is simulated from its predecessor. And the largest product of a
+        simulated step and the fastest rate.
     """
     nodes = _time_nodes(ssm, times[0], times, breakpoints, steps, has_state=True)
-    integrate = _interval_integrator(ssm, nodes.steps)
+    integrate = _interval_integrator(ssm, nodes.steps, is_stiff)
     if nodes.origin.shape[0] > times.shape[0]:
         is_row = nodes.origin < times.shape[0]
         index = jnp.minimum(nodes.origin, times.shape[0] - 1)
         states, is_given, times = states[index], is_given[index] & is_row, nodes.times
 
-    def state_at_node(state: jax.Array, interval: tuple) -> tuple[jax.Array, jax.Array]:
+    def state_at_node(state: jax.Array, interval: tuple) -> tuple[jax.Array, tuple]:
         start, end, interval_key, given_state, has_state, state_map = interval
-        state = jax.lax.cond(has_state, lambda: given_state, lambda: integrate(state, start, end, interval_key))
+        none = StepExtremes(jnp.zeros_like(start), jnp.zeros_like(start))
+        state, extremes = jax.lax.cond(has_state, lambda: (given_state, none),
+                                       lambda: integrate(state, start, end, interval_key))
         state = state if state_map is None else state_map.apply(state)
-        return state, state
+        return state, (state, extremes.product)
 
     keys = jax.random.split(key, times.shape[0] - 1)
     later_maps = jax.tree.map(lambda a: a[1:], nodes.state_map)
-    _, later_states = jax.lax.scan(state_at_node, states[0],
-                                   (times[:-1], times[1:], keys, states[1:], is_given[1:], later_maps))
-    return jnp.concatenate([states[:1], later_states])[nodes.rows]
+    _, (later_states, products) = jax.lax.scan(state_at_node, states[0], (times[:-1], times[1:], keys, states[1:],
+                                                                         is_given[1:], later_maps))
+    return jnp.concatenate([states[:1], later_states])[nodes.rows], jnp.max(products, initial=0.0)
 
 
-def _interval_integrator(ssm: StateSpaceModel, steps: int) -> Callable[..., jax.Array]:
+def _interval_integrator(ssm: StateSpaceModel, steps: int, is_stiff: bool) -> Callable[..., tuple]:
     """Return the function from a joint state, the start and end of an interval and a key to the state at the end."""
     jumps = ssm.stack.jump_roots()
 
-    def integrate(state: jax.Array, start: jax.Array, end: jax.Array, interval_key: jax.Array) -> jax.Array:
+    def integrate(state: jax.Array, start: jax.Array, end: jax.Array,
+                  interval_key: jax.Array) -> tuple[jax.Array, StepExtremes]:
         h = (end - start) / steps
         transition, covariance = ssm.stack.discretise(h)
         root = semidefinite_root(covariance)
         span = Span.between(start, end, end - start)
 
-        def step(state: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
+        def step(state: jax.Array, index: jax.Array) -> tuple[jax.Array, jax.Array]:
             keys = split_by_name(jax.random.fold_in(interval_key, index), ("forces", "process noise", "jumps"))
-            state = _simulation_step(ssm, state, span.shifted(index * h), h, transition, root, keys)
+            state, rate = _simulation_step(ssm, state, span.shifted(index * h), h, transition, root, keys, is_stiff)
             # The last step must end exactly at the end of the interval, so that a jump there is crossed once.
             step_end = jnp.where(index == steps - 1, end, start + (index + 1) * h)
-            return _cross_jumps(ssm, jumps, state, start + index * h, step_end, keys["jumps"]), None
+            return _cross_jumps(ssm, jumps, state, start + index * h, step_end, keys["jumps"]), rate
 
-        return jax.lax.scan(step, state, jnp.arange(steps))[0]
+        state, rates = jax.lax.scan(step, state, jnp.arange(steps))
+        is_finite = jnp.isfinite(state).all() & jnp.isfinite(rates).all()
+        # Between equal times there is no step.
+        rate = jnp.where(h > 0, jnp.where(is_finite, jnp.max(rates), jnp.inf), 0.0)
+        return state, StepExtremes(rate, jnp.where(h > 0, rate * jnp.where(h > 0, h, 1.0), 0.0))
 
     return integrate
 
 
 def _simulation_step(ssm: StateSpaceModel, state: jax.Array, span: Span, h: jax.Array, transition: jax.Array,
-                     root: jax.Array, keys: Mapping[str, jax.Array]) -> jax.Array:
-    """Return the joint state (n,) after one integration step of length h from the start of ``span``.
+                     root: jax.Array, keys: Mapping[str, jax.Array], is_stiff: bool) -> tuple[jax.Array, jax.Array]:
+    """Return the joint state (n,) after one integration step of length h, and the fastest rate at its start.
 
-    ``transition`` is that of the forces over the step, ``root`` a square root of their process noise; ``keys`` are
-    random keys of "forces" and "process noise".
+    Args:
+        ssm: the state-space model.
+        state: (n,), at the start.
+        span: times from the start of the step on.
+        h: length of the step.
+        transition: of the forces over the step.
+        root: square root of their process noise.
+        keys: random keys of "forces" and "process noise".
+        is_stiff: whether a step that is longer than the fastest time constant is exponential.
     """
     size = ssm.physical_dim
     white_noise = jax.random.normal(keys["forces"], (ssm.force_dim, 1))
@@ -268,11 +391,29 @@ def _simulation_step(ssm: StateSpaceModel, state: jax.Array, span: Span, h: jax.
     inputs = ssm.inputs(state, t)
     stage1 = ssm.drift(inputs, t)
     dispersion = ssm.dispersion(inputs, t)
+    jacobian = jax.jacfwd(lambda x: ssm.drift(jnp.concatenate([x, inputs[size:]]), t))(x)
+    rate = fastest_rate(jacobian)
+
+    def explicit() -> jax.Array:
+        return _runge_kutta_change(ssm, state, forces, span, h, stage1, dispersion, keys["process noise"])
+
+    def exponential() -> jax.Array:
+        end = span.time(h)
+        at_end = ssm.drift(ssm.inputs(jnp.concatenate([x, forces]), end), end)
+        return exponential_change(h, jacobian, stage1, at_end, dispersion, keys["process noise"])
+
+    change = jax.lax.cond(rate * h <= LONGEST_PRODUCT, explicit, exponential) if is_stiff else explicit()
+    return jnp.concatenate([x + change, forces]), rate
+
+
+def _runge_kutta_change(ssm: StateSpaceModel, state: jax.Array, forces: jax.Array, span: Span, h: jax.Array,
+                        stage1: jax.Array, dispersion: jax.Array | None, key: jax.Array) -> jax.Array:
+    """Return the change of the physical state in an explicit step, with ``forces`` at its end."""
+    size = ssm.physical_dim
+    x, end = state[:size], span.time(h)
     noise = jnp.zeros(size)
     if dispersion is not None:
-        white_noise = jax.random.normal(keys["process noise"], (dispersion.shape[1], 1))
-        noise = jnp.sqrt(h) * matmul(dispersion, white_noise)[:, 0]
-    end = span.time(h)
+        noise = jnp.sqrt(h) * matmul(dispersion, jax.random.normal(key, (dispersion.shape[1], 1)))[:, 0]
     midpoint_forces = 0.5 * (state[size:] + forces)
 
     def drift(change: jax.Array, z: jax.Array, time: jax.Array) -> jax.Array:
@@ -281,7 +422,7 @@ def _simulation_step(ssm: StateSpaceModel, state: jax.Array, span: Span, h: jax.
     stage2 = drift(0.5 * (h * stage1 + noise), midpoint_forces, span.time(0.5 * h))
     stage3 = drift(0.5 * (h * stage2 + noise), midpoint_forces, span.time(0.5 * h))
     stage4 = drift(h * stage3 + noise, forces, end)
-    return jnp.concatenate([x + h / 6 * (stage1 + 2 * stage2 + 2 * stage3 + stage4) + noise, forces])
+    return h / 6 * (stage1 + 2 * stage2 + 2 * stage3 + stage4) + noise
 
 
 def _cross_jumps(ssm: StateSpaceModel, jumps: Any, state: jax.Array, start: jax.Array, end: jax.Array,

@@ -395,3 +395,16 @@ def pivoted_cholesky(p: jax.Array, rank: int) -> tuple[jax.Array, jax.Array]:
 
 def _divide(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.where(b != 0, a / jnp.where(b != 0, b, 1.0), 0.0)
+
+
+def fastest_rate(jacobian: jax.Array) -> jax.Array:
+    """Estimate the largest modulus of an eigenvalue of the Jacobian (M, n) in the physical state, |K^8|^(1/8).
+
+    The units of the states matter little: a ratio of 1,000 between them makes it 2.4 times as large at most.
+    """
+    size = jacobian.shape[0]
+    largest = jnp.maximum(jnp.max(jnp.abs(jacobian[:, :size]), initial=0.0), 1e-300)
+    power = jacobian[:, :size] / largest
+    for _ in range(3):
+        power = matmul(power, power)
+    return largest * jnp.maximum(jnp.max(jnp.abs(power), initial=0.0), 1e-100) ** 0.125

@@ -31,6 +31,7 @@ from lfm_ppl.inference import sampling
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.degenerate_mode import degenerate_entries
 from lfm_ppl.inference.kernels.options import check_options
+from lfm_ppl.inference.long_steps import long_step_messages
 from lfm_ppl.inference.map import check_sites, mode_of
 from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.samplers import SAMPLERS
@@ -211,7 +212,8 @@ def fit(
             noise is given row by row.
         ConvergenceWarning: R-hat above 1.01, fewer than 100 effective draws a chain, divergences, a degenerate
             posterior mode; each with a remedy.
-        ApproximationWarning: more iterations, shorter steps or a smaller ``max_step`` would change the posterior.
+        ApproximationWarning: more iterations, shorter steps or a smaller ``max_step`` would change the posterior;
+            before the sampling, an explicit step is too long for a fast decay at the mode or the start.
 
     Example:
         >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
@@ -371,6 +373,8 @@ def _sample(problem: FitProblem, store: Checkpoint | None, show_progress: bool) 
         start = find_start(bound, options, setup)
     if show_progress and setup is None and FALLBACK in start.attributes:
         print(f"note     {start.attributes[FALLBACK]}", file=sys.stderr, flush=True)
+    if start.points is not None:
+        _warn_of_long_steps(problem, start.points[0] if start.mode is None else start.mode)
     attributes = {**start.attributes, "thin": options.thin}
     if store is not None:
         if setup is None:
@@ -385,6 +389,14 @@ def _sample(problem: FitProblem, store: Checkpoint | None, show_progress: bool) 
     partial = _number_of_draws(count, options.samples) if chains.done < chains.total else None
     values, statistics = _constrained_draws(bound, {"z": chains.z, **chains.statistics}, options.samples)
     return PosteriorDraws(values, statistics, chains.z, attributes, start.particle_options, partial)
+
+
+def _warn_of_long_steps(problem: FitProblem, z: np.ndarray) -> None:
+    """Warn, before the sampling, of steps that are too long for a fast decay at the start or the mode z (d,)."""
+    has_method = problem.options.sampler != "pmmh"
+    messages = best_effort("check of the steps", lambda: long_step_messages(problem.bound, z, has_method), [])
+    for message in messages:
+        checks.warn(message, ApproximationWarning)
 
 
 def _partial_result_writer(problem: FitProblem, attributes: dict[str, Any],
@@ -428,6 +440,7 @@ def _draw_about_mode(problem: FitProblem, store: Checkpoint | None, show_progres
 
     def compute() -> dict[str, Any]:
         mode = mode_of(options.keys["mode"], bound, init=None if isinstance(options.init, str) else options.init)
+        _warn_of_long_steps(problem, mode.mode)
         attributes = {"map_converged": int(mode.converged), "map_message": mode.message,
                       "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence),
                       arviz_data.MODE: json.dumps({name: value.tolist() for name, value in

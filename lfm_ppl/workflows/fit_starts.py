@@ -52,12 +52,14 @@ class ChainStart:
         points: (C, d) starting points; None in a resumed run.
         attributes: of the result, with ``warmup``, the number of warm-up draws.
         particle_options: keyword arguments of the particle smoother; empty for other samplers.
+        mode: (d,), the posterior mode where it is known.
     """
 
     sampler: BoundSampler
     points: np.ndarray | None
     attributes: dict[str, Any]
     particle_options: dict[str, Any] = field(default_factory=dict)
+    mode: np.ndarray | None = None
 
     @property
     def setup(self) -> dict[str, Any]:
@@ -108,7 +110,7 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
         nuts = dataclasses.replace(nuts, slow_warmup_hint="")
     if laplace is not None:
         points = starting_points(options.keys["starts"], bound, laplace, options.chains)
-        return ChainStart(nuts, points, {"warmup": warmup, "init": "laplace"})
+        return ChainStart(nuts, points, {"warmup": warmup, "init": "laplace"}, mode=laplace.mode)
     strategy = init_to_median if is_at_mode else _strategy(bound, options)
     points = _starting_points(bound, options, strategy, nuts.evaluate)
     init = "strategy" if callable(options.init) else "median"
@@ -142,7 +144,8 @@ def _find_random_walk_start(bound: BoundModel, options: FitOptions, setup: Mappi
         points = _draws_about_mode(bound, options, mode)
     if isinstance(kernel, ParticleMarginalRAM):
         kernel.prepare(bound, points[0])
-    return _random_walk_start(bound, options, kernel, points)
+    start = _random_walk_start(bound, options, kernel, points)
+    return start if mode is None else dataclasses.replace(start, mode=mode.mode)
 
 
 def _random_walk_start(bound: BoundModel, options: FitOptions, kernel: RAM, points: np.ndarray | None) -> ChainStart:

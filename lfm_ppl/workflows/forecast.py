@@ -40,7 +40,8 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
     Up to the last observation, at T, the path is a draw of the Gaussian smoother (of the particle smoother where the
     result was sampled by "pmmh"). After it there is nothing to condition on, so that no approximation is needed but
     that of the state at T: where the dynamics are not linear, the path is SIMULATED on from its own state at T, by the
-    steps of `lfm_ppl.simulate`. The Gaussian moments that a filter would carry on keep mean and variance roughly right
+    steps of `lfm_ppl.simulate`, none longer than a step of the fit, and exponential where they would be longer than the
+    fastest time constant. The Gaussian moments that a filter would carry on keep mean and variance roughly right
     and the shape wrong: a state in a double well would be put between the wells, and a force with a softplus would push
     below zero. Errors of the shape grow with the horizon, where a filter is never corrected by data. For linear
     dynamics the moments are exact, and the path is drawn from them. With a linear observation, y* given theta is normal
@@ -74,6 +75,9 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
             its settings, its parameters or its log likelihood at the draws; a known input that ends before ``times``;
             noise whose covariance is given row by row.
         TypeError: ``result`` is no ArviZ object; the model needs a keyword argument.
+
+    Warns:
+        UserWarning: a simulated state is not finite.
 
     Example:
         >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm

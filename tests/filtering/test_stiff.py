@@ -155,3 +155,41 @@ def test_gradients(options):
 def test_an_unknown_method_is_refused():
     with pytest.raises(ValueError, match="method"):
         lfm.MarginalLikelihood(ROBERTSON, ROBERTSON_TIMES, method="implicit")
+
+
+def follower(rate, weather):
+    return lfm.LatentForceModel(
+        lambda x, u, t: rate * (weather(t) - x), {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.ones(1)),
+        lfm.Gaussian(jnp.array([weather(0.0)]), jnp.zeros((1, 1))), initial_time=0.0)
+
+
+@pytest.mark.parametrize("rate", [10.0, pytest.param(1e3, marks=pytest.mark.slow), 1e6])
+def test_a_tolerance_for_a_fast_state_that_follows_an_input(rate):
+    """x' = r (10 + 5 sin(t / 3.8) - x), and the same with a table of the input that is linear between hours."""
+    times, frequency = np.arange(1.0, 13.0), 1 / 3.8
+
+    def lagged(t):
+        return 10 + 5 * rate * (rate * np.sin(frequency * t) - frequency * np.cos(frequency * t)) / (
+            rate**2 + frequency**2)
+
+    exact = lagged(times) + (10.0 - lagged(0.0)) * np.exp(-rate * times)
+    smooth_input = follower(rate, lambda t: 10 + 5 * jnp.sin(frequency * t))
+    result = lfm.filter(smooth_input, times, np.zeros((12, 1)), method="exponential", tolerance=1e-3)
+    np.testing.assert_allclose(result.predicted_mean[:, 0], exact, rtol=2e-5)
+
+    hours = np.arange(14.0)
+    table = 10 + 5 * np.sin(frequency * hours)
+    x, exact = table[0], []
+    for start, end in zip(table[:12], table[1:13], strict=True):
+        lag = (end - start) / rate
+        x = end - lag + (x - start + lag) * np.exp(-rate)
+        exact.append(x)
+    linear_input = follower(rate, lfm.Input(hours, table, "linear", "hold"))
+    result = lfm.filter(linear_input, times, np.zeros((12, 1)), method="exponential", tolerance=1e-3)
+    np.testing.assert_allclose(result.predicted_mean[:, 0], exact, rtol=1e-8)
+
+
+def test_a_breakdown_of_a_linear_model_with_a_tolerance_names_steps():
+    model = follower(10.0, lambda t: 10 + 5 * jnp.sin(3000.0 * t))
+    with pytest.warns(lfm.FilterWarning, match=r"more steps.*tolerance"):
+        lfm.filter(model, np.array([1.0, 2.0]), np.zeros((2, 1)), method="exponential", tolerance=1e-3, steps=1)

@@ -98,3 +98,46 @@ def test_a_jump_at_a_row_is_never_lost():
         lambda x, u, t: u, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
     drawn = lfm.simulate(jax.random.key(0), model, times, steps=3).forces["u"]
     assert len(np.unique(drawn)) == 40
+
+
+def test_a_fast_rate_between_sparse_times():
+    """The explicit step between two times would be 36 time constants long."""
+    gut = lfm.LatentForceModel(
+        lambda x, u, t: jnp.stack([-jnp.exp(u[0]) * x[0]]), {"log_rate": lfm.Matern(0.01, 4.0, mean=5.7)},
+        lfm.GaussianObservation(whole_state, jnp.array([0.01])), lfm.Gaussian(jnp.array([100.0]), jnp.zeros((1, 1))),
+        initial_time=0.0)
+    saturable = lfm.LatentForceModel(
+        lambda x, u, t: -50 * x / (2 + x), {}, lfm.GaussianObservation(whole_state, jnp.array([0.01])),
+        lfm.Gaussian(jnp.array([40.0]), jnp.zeros((1, 1))), initial_time=0.0)
+    for model in (gut, saturable):
+        state = lfm.simulate(jax.random.key(0), model, np.array([2.0, 12.0])).state[:, 0]
+        np.testing.assert_allclose(state, 0.0, atol=1e-8)
+    y = lfm.MarginalLikelihood(saturable, np.array([2.0, 12.0])).sample(jax.random.key(0))
+    assert np.abs(y).max() < 0.6
+
+
+def test_a_rate_that_no_step_resolves():
+    """Within a lag of 1e-7 of its equilibrium, by exponential steps."""
+    model = lfm.LatentForceModel(
+        lambda x, u, t: -1e7 * (x**3 + x - 2 - jnp.sin(t)), {}, lfm.GaussianObservation(whole_state, jnp.ones(1)),
+        lfm.Gaussian(jnp.array([1.0]), jnp.zeros((1, 1))), initial_time=0.0)
+    x = float(lfm.simulate(jax.random.key(0), model, np.array([20.0])).state[0, 0])
+    assert x**3 + x - 2 - np.sin(20.0) == pytest.approx(0.0, abs=1e-4)
+
+
+def test_the_law_does_not_depend_on_the_requested_times():
+    """Stationary variances of a fast linear SDE, G^2 / (2 rate), with one key for many draws."""
+    model = lfm.LatentForceModel(
+        lambda x, u, t: -200 * (x - 1), {}, lfm.GaussianObservation(whole_state, jnp.ones(1)),
+        lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))), process_noise=jnp.array([[2.0]]), initial_time=0.0)
+    keys = jax.random.split(jax.random.key(1), 2000)
+    for times in ([1.0], [0.5, 0.9, 1.0]):
+        draw = jax.jit(jax.vmap(lambda key, times=times: lfm.simulate(key, model, np.array(times), steps=5).state[-1]))
+        within_monte_carlo_error(np.asarray(draw(keys)), np.ones(1), np.array([[0.01]]))
+
+
+def test_what_is_not_finite_is_said():
+    model = lfm.LatentForceModel(lambda x, u, t: x**2, {}, lfm.GaussianObservation(whole_state, jnp.ones(1)),
+                                 lfm.Gaussian(jnp.ones(1), jnp.zeros((1, 1))), state_names=("x",), initial_time=0.0)
+    with pytest.warns(UserWarning, match="'x' is not finite from time 2"):
+        lfm.simulate(jax.random.key(0), model, np.array([0.5, 2.0]))

@@ -274,3 +274,33 @@ def test_bands_cover_new_data_over_200_runs(model):
           f"first row {100 * covered[:, 0].mean():.1f}%, last row {100 * covered[:, -1].mean():.1f}%; 50% bands "
           f"{100 * half:.1f}%")
     assert abs(rate - 0.95) < 0.03
+
+
+def elimination(times, y=None, limit=50.0, start=3000.0, **options):
+    """Elimination that saturates: the rate is the limit over 2 once the drug is gone, and slow before."""
+    half = numpyro.sample("half", dist.LogNormal(np.log(2.0), NEAR))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: -limit * x / (half + x), {}, lfm.GaussianObservation(systems.whole_state, jnp.array([0.01])),
+        lfm.Gaussian(jnp.array([start]), jnp.zeros((1, 1))), state_names=("drug",), initial_time=0.0)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, iterations=0, **options), obs=y)
+
+
+@pytest.mark.parametrize("at", [[72.0], pytest.param([42.0, 57.0, 58.5, 60.0, 61.0, 72.0], marks=pytest.mark.slow)],
+                         ids=["sparse", "dense"])
+def test_a_decay_that_is_fast_after_the_data_only(at):
+    """Two time constants and more in an explicit step of the simulation."""
+    times = np.arange(6.0, 37.0, 6.0)
+    data = 3000.0 - 50.0 * times[:, None] + 0.2
+    result = lfm.fit(elimination, times, data, sampler="map", samples=4, trajectory_draws=0, progress=False)
+    ahead = predictions(lfm.forecast(result, elimination, at, progress=False))
+    np.testing.assert_allclose(ahead["states"].sel(time=72.0), 0.0, atol=1e-2)
+
+
+@pytest.mark.slow
+def test_a_stiff_fit_has_a_stiff_forecast():
+    options = {"limit": 6000.0, "start": 0.5, "method": "exponential"}
+    times = np.array([2.0, 4.0, 6.0])
+    result = lfm.fit(elimination, times, np.zeros((3, 1)), sampler="map", samples=4, trajectory_draws=0, progress=False,
+                     model_kwargs=options)
+    ahead = predictions(lfm.forecast(result, elimination, [8.0, 200.0], progress=False, model_kwargs=options))
+    np.testing.assert_allclose(ahead["states"], 0.0, atol=1e-8)
