@@ -170,18 +170,25 @@ class StateMap(NamedTuple):
         return (state if self.keep is None else self.keep * state) + self.offset
 
 
+NO_EVENT, IMPOSSIBLE_EVENT = -1, -2
+"""Entries of the table of state maps: the identity, and NaN for an event before the initial time or at no time."""
+
+
 class EventTable(NamedTuple):
-    """All events of a model, one entry each.
+    """All events of a model that move the state at once, one entry each.
 
     Attributes:
-        times: (E,), infinite where the time is traced, NaN for an event that does not happen.
+        times: (E,), infinite where the time is traced.
         traced_times: (E,), with the traced times; None if all are concrete.
         observation_first: (E,), whether an observation at the same time comes first.
+        start: time of a given state, which includes the events before it; None: the state is that of the model at its
+            initial time, before which there are no events.
     """
 
     times: np.ndarray
     traced_times: Any
     observation_first: np.ndarray
+    start: Any = None
 
     @property
     def all_times(self) -> Any:
@@ -193,13 +200,24 @@ class EventTable(NamedTuple):
         """Whether the time of an event is traced (E,)."""
         return np.isinf(self.times)
 
-    def exclude_past(self, time: Any) -> EventTable:
-        """Return the table in which events that a filter's state at a time includes do not happen any more."""
-        start = checks.concrete(time)
-        if start is None:
-            return self
-        is_past = (self.times < start) | ((self.times == start) & ~self.observation_first)
-        return self._replace(times=np.where(is_past, np.nan, self.times))
+    def is_past(self, times: Any) -> Any:
+        """Return whether the state at ``start`` includes an event, if it is at one of ``times`` (E,)."""
+        if self.start is None:
+            return np.zeros(len(self.times), bool)
+        return (times < self.start) | ((times == self.start) & ~self.observation_first)
+
+    def place(self, first: Any, last: Any) -> tuple[jax.Array, jax.Array]:
+        """Return times (E,) of the events within ``first`` to ``last``, and their entries in the table of state maps.
+
+        The entry is `NO_EVENT` for an event after ``last`` or one that is past, and `IMPOSSIBLE_EVENT` where a traced
+        time is NaN or before ``first``: the moments, and with them the density, are then not finite.
+        """
+        times = jnp.asarray(self.all_times, float)
+        is_possible, is_later = times >= first, times > last
+        entry = jnp.where(is_possible, np.arange(len(self.times)), IMPOSSIBLE_EVENT)
+        entry = jnp.where(self.is_past(times) | is_later, NO_EVENT, entry)
+        # At the bounds themselves the derivative is that of the time, one-sided.
+        return jnp.where(is_possible, jnp.where(is_later, last, times), first), entry
 
 
 def check_start(times: np.ndarray, origin: float) -> None:
@@ -220,7 +238,7 @@ def event_table(events: Sequence[Event]) -> EventTable:
 
 
 def state_maps(events: Sequence[Event], state_names: Sequence[str], size: int) -> StateMap | None:
-    """Return the maps of all E events on the joint state, and as entry -1 the identity; None without events.
+    """Return the maps of all E events on the joint state, of `IMPOSSIBLE_EVENT` and `NO_EVENT`; None without events.
 
     Args:
         events: the events of a model.
@@ -231,9 +249,9 @@ def state_maps(events: Sequence[Event], state_names: Sequence[str], size: int) -
         return None
     keep, offset = (jnp.concatenate(rows) for rows in zip(*(event.map(state_names) for event in events), strict=True))
     columns = size - len(state_names)
-    offset = jnp.pad(offset, ((0, 1), (0, columns)))
+    offset = jnp.pad(offset, ((0, 2), (0, columns))).at[IMPOSSIBLE_EVENT].set(jnp.nan)
     has_resets = any(event.is_reset for event in events)
-    return StateMap(jnp.pad(keep, ((0, 1), (0, columns)), constant_values=1.0) if has_resets else None, offset)
+    return StateMap(jnp.pad(keep, ((0, 2), (0, columns)), constant_values=1.0) if has_resets else None, offset)
 
 
 def _concrete(value: Any) -> Any:
