@@ -103,9 +103,9 @@ def insert_traced_times(grid: TimeGrid, breakpoints: Any, events: EventTable, is
     """Return a time grid whose intervals end at traced breakpoints (K,) and at some of the events (E,) as well.
 
     Their number is that of all breakpoints and events, wherever they lie: those outside of the grid's times end
-    intervals of length zero. Events after the last time do not happen; see `EventTable.place` for those before the
-    initial time. At equal times the order is that of concrete times. The sorted times are continuous in the inserted
-    times, and differentiable but where two meet.
+    intervals of length zero. Events after the last time do not happen; see `EventTable.entries_within` for those before
+    the initial time. At equal times the order is that of concrete times. The sorted times are continuous in the
+    inserted times, and differentiable but where two meet.
     """
     index = np.flatnonzero(is_inserted)
     count = np.shape(breakpoints)[0]
@@ -114,7 +114,7 @@ def insert_traced_times(grid: TimeGrid, breakpoints: Any, events: EventTable, is
     intervals, origin = grid.intervals, jnp.asarray(grid.initial_time, float)
     # The last one exactly as the times of events are counted, so that an event at the last time is not past it.
     since_end = jnp.append(jnp.asarray(grid.since)[1:], intervals.end[-1] - origin)
-    event_times, entries = (a[index] for a in events.place(origin, intervals.end[-1]))
+    event_times, entries = (a[index] for a in events.entries_within(origin, intervals.end[-1]))
     inserted = jnp.concatenate([jnp.clip(breakpoints - origin, 0.0, since_end[-1]), event_times - origin])
     merged = jnp.concatenate([since_end, inserted])
     order = jnp.lexsort((*_order_at_equal_times(intervals, events, index, count), jax.lax.stop_gradient(merged)))
@@ -137,8 +137,9 @@ def _order_at_equal_times(intervals: Intervals, events: EventTable, index: np.nd
                           count: int) -> tuple[jax.Array, jax.Array]:
     """Return the event at the end of each interval, and its rank beside an observation, as keys of a sort.
 
-    The intervals are those of the grid, ``count`` at breakpoints, and those at the inserted events ``index``. Events of
-    one rank keep the order of the model. A jump of the forces needs no rank: it commutes with the events of the states.
+    The intervals of the grid come first, then ``count`` that end at breakpoints, then those at the inserted events
+    ``index``. Events of one rank keep the order of the model. A jump of the forces needs no rank, because it commutes
+    with the events of the states.
     """
     event = jnp.concatenate([jnp.asarray(intervals.event), np.full(count, NO_EVENT), index])
     rank_of_event = np.append(np.where(events.observation_first, EVENT_AFTER, EVENT_BEFORE), OBSERVATION)

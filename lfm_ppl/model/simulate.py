@@ -138,7 +138,7 @@ def _time_nodes(ssm: StateSpaceModel, start: jax.Array, times: jax.Array, breakp
     ``has_state``: whether the state at the start is given, so that events before an observation there have happened.
     """
     events = event_table(ssm.model.events)._replace(start=start if has_state else None)
-    event_times, entries = events.place(start, times[-1])
+    event_times, entries = events.entries_within(start, times[-1])
     breakpoints = jnp.concatenate([jnp.asarray(breakpoints, float), event_times])
     count, breakpoint_count = times.shape[0], breakpoints.shape[0]
     if not breakpoint_count:
