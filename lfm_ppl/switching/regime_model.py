@@ -42,7 +42,7 @@ def check_models(models: Any) -> dict[str, LatentForceModel]:
     initial_times = {name: model.initial_time for name, model in models.items()}
     if not checks.traced(list(initial_times.values())) and len({str(time) for time in initial_times.values()}) > 1:
         raise ValueError(f"the models of all regimes need one initial_time, got {initial_times}.")
-    events = [jax.tree.flatten(model.events) for model in models.values()]
+    events: list[tuple[list[Any], Any]] = [jax.tree.flatten(model.events) for model in models.values()]
     first_leaves, first_structure = events[0]
     for leaves, structure in events[1:]:
         if structure != first_structure or not all(
