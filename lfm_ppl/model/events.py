@@ -40,7 +40,7 @@ class Event(eqx.Module):
         is_reset: whether the state is set to the value, and not moved by it.
     """
 
-    label: ClassVar[str] = "event"
+    label: ClassVar[str] = "an event"
     argument: ClassVar[str] = "amounts"
 
     times: Any
@@ -54,22 +54,22 @@ class Event(eqx.Module):
     def __init__(self, times: ArrayLike, values: ArrayLike, target: Any, lag: ArrayLike, observation_first: bool,
                  is_reset: bool):
         label, argument = self.label, self.argument
-        checks.refuse_dates(f"times of a {label}", times)
-        checks.finite(f"times of a {label}", times)
-        checks.finite(f"{argument} of a {label}", values)
-        checks.finite(f"lag of a {label}", lag)
+        checks.refuse_dates(f"times of {label}", times)
+        checks.finite(f"times of {label}", times)
+        checks.finite(f"{argument} of {label}", values)
+        checks.finite(f"lag of {label}", lag)
         self.times = _concrete(times)
         if np.ndim(self.times) != 1:
-            raise ValueError(f"times of a {label} must be a vector (K,), got shape {np.shape(times)}.")
+            raise ValueError(f"times of {label} must be a vector (K,), got shape {np.shape(times)}.")
         if np.shape(values) not in ((), np.shape(times)):
-            raise ValueError(f"{argument} of a {label} must be one number or one for each of the {np.size(self.times)} "
+            raise ValueError(f"{argument} of {label} must be one number or one for each of the {np.size(self.times)} "
                              f"times, got shape {np.shape(values)}.")
         if np.ndim(lag) > 1 or np.ndim(lag) == 1 and np.shape(lag) != np.shape(times):
-            raise ValueError(f"lag of a {label} must be one number or one for each time, got shape {np.shape(lag)}.")
+            raise ValueError(f"lag of {label} must be one number or one for each time, got shape {np.shape(lag)}.")
         self.values, self.lag = _concrete(values), _concrete(lag)
         is_name = isinstance(target, str) or target is None
         if not is_name:
-            checks.finite(f"target of a {label}", target)
+            checks.finite(f"target of {label}", target)
         self.state, self.direction = (target, None) if is_name else (None, _concrete(target))
         self.observation_first, self.is_reset = bool(observation_first), is_reset
 
@@ -80,7 +80,7 @@ class Event(eqx.Module):
 
     def delayed(self, lag: ArrayLike) -> Any:
         """Return the same events with a further ``lag``, () or (K,), which may be a parameter."""
-        checks.finite(f"lag of a {self.label}", lag)
+        checks.finite(f"lag of {self.label}", lag)
         return eqx.tree_at(lambda event: event.lag, self, _concrete(self.lag + lag))
 
     def check_target(self, state_names: Sequence[str]) -> None:
@@ -88,7 +88,7 @@ class Event(eqx.Module):
         if self.state is not None:
             checks.one_of("the target of an event", self.state, state_names)
         elif self.direction is not None and np.shape(self.direction) != (len(state_names),):
-            raise ValueError(f"the target of a {self.label} must be the name of a state or a vector with an entry for "
+            raise ValueError(f"the target of {self.label} must be the name of a state or a vector with an entry for "
                              f"each of the states {', '.join(state_names)}, got shape {np.shape(self.direction)}.")
 
     def direction_in(self, state_names: Sequence[str]) -> Any:
@@ -134,7 +134,7 @@ class Dose(Event):
     Source: Rowland and Tozer (2011), chapter 11.
     """
 
-    label: ClassVar[str] = "dose"
+    label: ClassVar[str] = "a dose"
 
     def __init__(self, times: ArrayLike, amounts: ArrayLike, target: Any, lag: ArrayLike = 0.0,
                  observation_first: bool = True):
@@ -175,7 +175,7 @@ class Infusion(Event):
     Source: Rowland and Tozer (2011), chapter 4.
     """
 
-    label: ClassVar[str] = "infusion"
+    label: ClassVar[str] = "an infusion"
     rates: Any
     durations: Any
 
@@ -269,7 +269,7 @@ class Reset(Event):
         [3.0]
     """
 
-    label: ClassVar[str] = "reset"
+    label: ClassVar[str] = "a reset"
     argument: ClassVar[str] = "values"
 
     def __init__(self, times: ArrayLike, state: str | None = None, values: ArrayLike = 0.0, lag: ArrayLike = 0.0,

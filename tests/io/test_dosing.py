@@ -179,7 +179,8 @@ def test_later_doses_continue_the_earlier_ones(read):
     joined = earlier.continued(later)
     assert joined.times.tolist() == [0.0, 8.0] and joined.durations.tolist() == [2.0, 0.0]
     assert joined.compartments.tolist() == [0, 1]
-    assert [event.state for event in Data([0.0], [[1.0]], ("DV",), inputs={"AMT": joined}).doses()] == ["gut", "blood"]
+    events = Data([0.0], [[1.0]], ("DV",), inputs={"AMT": joined}).doses()
+    assert [(type(event).__name__, event.state) for event in events] == [("Dose", "blood"), ("Infusion", "gut")]
 
 
 def test_the_command_line_names_states_and_roles():
