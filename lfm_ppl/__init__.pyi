@@ -46,6 +46,7 @@ from .linearisation.sigma_points import MonteCarlo as MonteCarlo
 from .linearisation.sigma_points import Unscented as Unscented
 from .linearisation.taylor import Taylor as Taylor
 from .model.events import Dose as Dose
+from .model.events import Infusion as Infusion
 from .model.events import Reset as Reset
 from .model.gaussian import Gaussian as Gaussian
 from .model.inputs import Input as Input

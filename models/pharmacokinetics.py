@@ -14,7 +14,8 @@ absorption that is slower than the elimination explains the same data as a fast 
 the priors prefer the fast one. The model is linear, so that filter, smoother and likelihood are exact.
 
 A data file has a column with the doses, in rows of its own or beside a concentration: ``--events COLUMN:gut`` where the
-column is not called ``dose``.
+column is not called ``dose``, ``--events AMT:gut,blood`` where a column CMT numbers gut and blood. A dose with a RATE
+or DUR is an infusion.
 
 Sources: M. Rowland and T. N. Tozer, Clinical Pharmacokinetics and Pharmacodynamics, 4th edition (2011), chapters 6, 11
 and 19; the unexplained input follows S. Sarkka, M. Alvarez and N. Lawrence, Gaussian process latent force models for
@@ -67,8 +68,7 @@ def build(absorption, lag, clearance, volume, scale, lengthscale, noise_sd, exch
         return jnp.stack([-absorbed, change - flow, flow])
 
     names = ("gut", "blood") if exchange is None else ("gut", "blood", "tissue")
-    delayed = [lfm.Dose(event.times, event.values, "gut", event.lag + lag, event.observation_first)
-               if event.state == "gut" and not event.is_reset else event for event in events]
+    delayed = [event.delayed(lag) if event.state == "gut" else event for event in events]
     return lfm.LatentForceModel(
         dynamics=dynamics,
         forces={"u": lfm.Matern(scale=scale, lengthscale=lengthscale, order=1)},
@@ -87,7 +87,7 @@ def model(times, y=None, events=(), compartments: int = 1, units=None) -> None:
     Args:
         times: observation times, shape (T,); the first one is that of the first dose or earlier.
         y: concentrations, shape (T, 1); NaN is missing, None draws from the prior predictive.
-        events: the doses, `lfm.Dose`; those to the state "gut" begin to be absorbed after the lag.
+        events: the doses, `lfm.Dose` and `lfm.Infusion`; those to the state "gut" begin to be absorbed after the lag.
         compartments: 1 or 2.
         units: name -> unit, for plots.
     """

@@ -9,6 +9,7 @@ import numpy as np
 
 from lfm_ppl.cli.options import RULES, Columns
 from lfm_ppl.io.data_set import DOSE
+from lfm_ppl.io.dosing import ONCE, ROLES
 from lfm_ppl.io.loading import ModelFile
 from lfm_ppl.utils import checks
 
@@ -66,8 +67,9 @@ def bounds(flag: str, texts: Sequence[str]) -> dict[str, float] | None:
 def inputs(columns: Columns, model: ModelFile) -> dict[str, tuple[str, str]]:
     """Return the known inputs to read: name -> column of the file, interpolation.
 
-    Columns of ``--inputs A,B:linear,C:zero`` are in the order of the model's inputs. Columns of ``--events A:STATE``
-    are doses. By default the columns have the names of the model's inputs.
+    Columns of ``--inputs A,B:linear,C:zero`` are in the order of the model's inputs. Columns of ``--events
+    A:STATE,STATE`` are doses, and ``B:CMT`` gives a column the role of one of `lfm_ppl.io.dosing.ROLES`. By default the
+    columns have the names of the model's inputs.
     """
     functions = {name: way for name, way in model.inputs.items() if not way.startswith(DOSE)}
     doses = {name: way for name, way in model.inputs.items() if way.startswith(DOSE)}
@@ -75,16 +77,23 @@ def inputs(columns: Columns, model: ModelFile) -> dict[str, tuple[str, str]]:
 
 
 def _doses(text: str | None, doses: Mapping[str, str]) -> dict[str, tuple[str, str]]:
-    """Return the columns of doses; the doses of a model to the same state keep their name."""
+    """Return the columns of doses, and of what describes them; doses of the model to the same state keep their name."""
     if text is None:
         return {name: (name, way) for name, way in doses.items()}
     columns: dict[str, tuple[str, str]] = {}
+    name = ""
     for part in text.split(","):
         column, colon, state = (word.strip() for word in part.partition(":"))
+        if name and column and not colon:  # a further state of the column before
+            columns[name] = (columns[name][0], f"{columns[name][1]},{column}")
+            continue
         if not (column and colon and state):
             raise ValueError(f"--events takes COLUMN:STATE, the column of the doses and the state that receives them, "
                              f"got {part!r}.")
-        name = next((name for name, way in doses.items() if way == DOSE + state), column)
+        if state in ROLES:
+            columns[column] = (column, state)
+            continue
+        name = next((name for name, way in doses.items() if way == DOSE + state.removesuffix(ONCE)), column)
         if name in columns:
             raise ValueError(f"--events names two columns for the doses {name!r} to {state}: {columns[name][0]} and "
                              f"{column}. Write them in one column.")

@@ -59,4 +59,5 @@ def _with_model_names(observed: Data, model: ModelFile, inputs: dict[str, tuple[
         raise ValueError(f"UNITS of {model.path} says that time is in {unit!r}, in which the dates of {path} cannot be "
                          f"counted. Write one of {', '.join(calendar_time.USUAL)}, or give --time-unit.")
     return dataclasses.replace(observed, outputs=model.outputs or observed.outputs,
-                               inputs={name: observed.inputs[column] for name, (column, _) in inputs.items()})
+                               inputs={name: observed.inputs[column] for name, (column, _) in inputs.items()
+                                       if column in observed.inputs})

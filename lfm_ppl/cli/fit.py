@@ -26,11 +26,11 @@ from lfm_ppl.cli.options import DataOptions, FitArguments
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.io import loading
-from lfm_ppl.io.data_set import OF_SERIES, Data, stack_series
+from lfm_ppl.io.data_set import OF_SERIES, Data, InputTable, stack_series
 from lfm_ppl.io.truth import read_truth
 from lfm_ppl.results import arviz_data, checkpoint, files, html_report, tables
 from lfm_ppl.results.fields import add_fields
-from lfm_ppl.utils import calendar_time
+from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.interruption import INTERRUPTED, interruptible
 from lfm_ppl.utils.progress import duration
 
@@ -110,6 +110,20 @@ def observed_data(options: DataOptions, model: loading.ModelFile, model_options:
     return model.prepare(observed)
 
 
+def _inputs_in_words(observed: Data) -> dict[str, str]:
+    """Return how each known input is read; of doses also their number and sum, over all series of a panel."""
+    groups: dict[str, list[InputTable]] = {}
+    for name, table in observed.inputs.items():
+        groups.setdefault(name.partition(OF_SERIES)[0], []).append(table)
+    words = {}
+    for name, members in groups.items():
+        words[name] = members[0].interpolation
+        if members[0].is_dose:
+            count = checks.counted(sum(len(table.times) for table in members), "dose")
+            words[name] += f", {count} of {sum(float(table.values.sum()) for table in members):g} in all"
+    return words
+
+
 def _print_data(options: FitArguments, model: loading.ModelFile, observed: Data, fixed: dict[str, Any]) -> None:
     print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")
     counts = dict(zip(observed.outputs, np.isnan(observed.y).reshape(-1, len(observed.outputs)).sum(axis=0),
@@ -127,8 +141,7 @@ def _print_data(options: FitArguments, model: loading.ModelFile, observed: Data,
     for name in (name for name, count in counts.items() if count == rows):
         print(f"note     {name} has no value: its own parameters follow the prior")
     if observed.inputs:
-        ways = {name.partition(OF_SERIES)[0]: table.interpolation for name, table in observed.inputs.items()}
-        print("inputs   " + ", ".join(f"{name} ({way})" for name, way in ways.items()))
+        print("inputs   " + ", ".join(f"{name} ({way})" for name, way in _inputs_in_words(observed).items()))
     if observed.origin is not None:
         print(f"time     in {observed.units['time']} since {observed.origin.replace('T', ' ')}")
     anchors = model.anchors(observed)

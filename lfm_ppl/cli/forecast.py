@@ -25,7 +25,7 @@ from lfm_ppl.cli.options import ForecastOptions, Times
 from lfm_ppl.cli.requested_times import requested_times
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
-from lfm_ppl.io.data_set import Data, InputTable, at_origin
+from lfm_ppl.io.data_set import Data, at_origin
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.results import arviz_data, files, html_report, inputs, plots, tables
 from lfm_ppl.results.plots.trajectories import trajectory_names
@@ -76,8 +76,8 @@ def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) 
     known_inputs = {}
     if held_out is not None:
         times = np.union1d(times, held_out.times)
-        known_inputs = {name: table if table.dosed_state else Input(*table) for name, table in (
-            (name, join_inputs(task.observed.inputs[name], later)) for name, later in held_out.inputs.items())}
+        known_inputs = {name: table if table.is_dose else Input(*table[:3]) for name, table in (
+            (name, task.observed.inputs[name].continued(later)) for name, later in held_out.inputs.items())}
     keywords: dict[str, Any] = {"inputs": known_inputs, "model_kwargs": task.keywords}
     forecast = lfm_ppl.forecast(task.posterior, task.model, times, draws=options.draws, seed=options.seed,
                                 progress=not options.quiet, **keywords)
@@ -88,13 +88,6 @@ def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) 
     scores = lfm_ppl.score(forecast, held_out, **({} if is_gaussian else {"numpyro_model": task.model, **keywords}))
     group = held_out_data(held_out.times, held_out.y, arviz_data.group(forecast, "observed_data"))
     return arviz_data.add_group(forecast, HELD_OUT, group), scores
-
-
-def join_inputs(earlier: InputTable, later: InputTable) -> InputTable:
-    """Return a known input followed by later values."""
-    is_earlier = earlier.times < later.times.min(initial=np.inf)
-    return InputTable(np.append(earlier.times[is_earlier], later.times),
-                      np.append(earlier.values[is_earlier], later.values), earlier.interpolation)
 
 
 def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data:
@@ -118,14 +111,14 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
         kinds = ("plain numbers", "dates") if read.origin is None else ("dates", "plain numbers")
         raise ValueError(f"{path}: its times are {kinds[0]}, the times of the result {kinds[1]}; use the same form.")
     read = dataclasses.replace(read, outputs=observed.outputs, inputs={
-        name: read.inputs[column] for name, (column, _) in columns.items()})
+        name: read.inputs[column] for name, (column, _) in columns.items() if column in read.inputs})
     if observed.origin is not None:
         read = at_origin(read, observed.origin, observed.units["time"])
     if repeated_rows := int(np.isin(read.times, observed.times).sum()):
         print(f"note     {repeated_rows} of {len(read.times)} rows of {path} are at times of the fitted data: if they "
               "are the same data, their scores are not scores of a forecast")
     prepared = task.file.prepare(dataclasses.replace(read, inputs={
-        name: join_inputs(observed.inputs[name], later) for name, later in read.inputs.items()}))
+        name: observed.inputs[name].continued(later) for name, later in read.inputs.items()}))
     if not np.array_equal(prepared.y, read.y, equal_nan=True):
         raise ValueError(f"{task.file.path} changes the numbers of a data file in `prepare`, so that held-out numbers "
                          "may not be comparable with the fitted ones. Score them in Python, on the model's scale: "

@@ -10,6 +10,7 @@ import numpy as np
 from lfm_ppl.cli import session
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data, InputTable
+from lfm_ppl.io.dosing import ONCE
 
 _TYPES = {float: "a number", int: "a whole number", bool: "true or false"}
 
@@ -60,7 +61,7 @@ def _bind(model: loading.ModelFile) -> Any:
         data = model.simulate()
     else:
         times, outputs = np.arange(3.0), model.outputs or ("y",)
-        inputs = {name: InputTable(times, np.ones(3), way) for name, way in model.inputs.items()}
+        inputs = {name: InputTable(times, np.ones(3), way.removesuffix(ONCE)) for name, way in model.inputs.items()}
         labels = ("1", "2") if loading.is_panel(str(model.path)) else ()
         shape = (2, 3) if labels else (3,)
         data = Data(np.broadcast_to(times, shape), np.zeros((*shape, len(outputs))), outputs, units=model.units,

@@ -136,8 +136,9 @@ class Columns:
     rows; blank cells are interpolated, with :zero they are zero (default: columns with the names of the model's
     inputs)"""
     events: Annotated[Text, Parameter(metavar="COLUMN:STATE,...")] | None = None
-    """columns of doses, and the states that receive them at the times of rows with a number (default: columns with the
-    names of the model's doses)"""
+    """columns of doses, and the states that receive them at the times of rows with a number; STATE,STATE in the order
+    of a column CMT, STATE:once where the column repeats one dose. Columns EVID, MDV, ADDL, II, CMT, RATE and DUR are
+    read as in NONMEM; COLUMN:CMT names such a column (default: columns with the names of the model's doses)"""
 
     def refuse_without(self, flag: str, file: str | None, **more: str | None) -> None:
         """Raise ValueError for a column, or another option about a data file, if there is no file."""

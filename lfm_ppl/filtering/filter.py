@@ -51,7 +51,7 @@ class FilterResult(eqx.Module):
 
     Attributes:
         times: (T,).
-        log_likelihood: (T,), log p(y_k | y_1:k-1) of the entries that are present.
+        log_likelihood: (T,), log p(y_k | y_1:k-1) of the entries that are present; -inf where the filter breaks down.
         predicted_mean, predicted_covariance: (T, n), (T, n, n) of the joint state, before each observation.
         filtered_mean, filtered_covariance: after it.
         whitened_innovation: (T, D), innovations whitened by their Cholesky factor: independent standard normals for a
@@ -167,7 +167,8 @@ def filter_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, ti
     residual = (quantile_residuals(family, prediction, y) if isinstance(family, ObservationFamily)
                 else whitened_innovations(at_data, y))
     state = FilterState(times[-1], at_data.filtered.mean[-1], at_data.filtered.covariance[-1])
-    return FilterResult(times, at_data.log_likelihood, at_data.predicted.mean, at_data.predicted.covariance,
+    log_likelihood = jnp.where(jnp.isnan(at_data.log_likelihood), -jnp.inf, at_data.log_likelihood)
+    return FilterResult(times, log_likelihood, at_data.predicted.mean, at_data.predicted.covariance,
                         at_data.filtered.mean, at_data.filtered.covariance, residual, state)
 
 

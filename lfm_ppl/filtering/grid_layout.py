@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, intervals_between
-from lfm_ppl.model.events import EventTable
+from lfm_ppl.model.events import NO_EVENT, EventTable
 from lfm_ppl.model.inputs import InputRead
 from lfm_ppl.model.state_space import inset
 
@@ -59,7 +59,7 @@ class GridLayout(NamedTuple):
                     "inset": 0.0, "length_index": 0 if lengths is None else len(lengths)}
             fields = {name: None if field is None else np.append(field, np.full(extra, tail[name]))
                       for name, field in fields.items()}
-            since = np.append(grid.since, np.full(extra, grid.since[-1] + grid.intervals.length[-1]))
+            since = np.append(grid.since, np.full(extra, grid.intervals.end[-1] - grid.initial_time))
             grid = grid._replace(intervals=Intervals(**fields), since=since)
             lengths = None if lengths is None else np.append(lengths, 0.0)
         if lengths is not None:
@@ -103,32 +103,44 @@ def insert_traced_times(grid: TimeGrid, breakpoints: Any, events: EventTable, is
     """Return a time grid whose intervals end at traced breakpoints (K,) and at some of the events (E,) as well.
 
     Their number is that of all breakpoints and events, wherever they lie: those outside of the grid's times end
-    intervals of length zero, and such events do not happen. The sorted times are continuous in the inserted times, and
-    differentiable but where two meet.
+    intervals of length zero. Events after the last time do not happen; see `EventTable.entries_within` for those before
+    the initial time. At equal times the order is that of concrete times. The sorted times are continuous in the
+    inserted times, and differentiable but where two meet.
     """
     index = np.flatnonzero(is_inserted)
     count = np.shape(breakpoints)[0]
     if not count + len(index):
         return grid
-    breakpoints = jnp.concatenate([breakpoints, jnp.asarray(events.all_times)[index]])
     intervals, origin = grid.intervals, jnp.asarray(grid.initial_time, float)
     # The last one exactly as the times of events are counted, so that an event at the last time is not past it.
     since_end = jnp.append(jnp.asarray(grid.since)[1:], intervals.end[-1] - origin)
-    inserted = jnp.clip(breakpoints - origin, 0.0, since_end[-1])
+    event_times, entries = (a[index] for a in events.entries_within(origin, intervals.end[-1]))
+    inserted = jnp.concatenate([jnp.clip(breakpoints - origin, 0.0, since_end[-1]), event_times - origin])
     merged = jnp.concatenate([since_end, inserted])
-    rank = np.concatenate([np.full(np.shape(since_end), OBSERVATION), np.full(count, EVENT_AFTER),
-                           np.where(events.observation_first[index], EVENT_AFTER, EVENT_BEFORE)])
-    order = jnp.lexsort((rank, jax.lax.stop_gradient(merged)))
+    order = jnp.lexsort((*_order_at_equal_times(intervals, events, index, count), jax.lax.stop_gradient(merged)))
     position = jnp.argsort(order)
     since_end = merged[order]
     since = jnp.concatenate([jnp.zeros(1), since_end[:-1]])
     end = jnp.concatenate([jnp.asarray(intervals.end), origin + inserted])[order]
     start = jnp.concatenate([jnp.reshape(origin, (1,)), end[:-1]])
     no_index = np.full(count + len(index), -1)
-    inserted_event = jnp.where(breakpoints - origin == inserted, np.append(no_index[:count], index), -1)
     observation, jump, event = (
         jnp.concatenate([jnp.asarray(a), b])[order]
-        for a, b in ((intervals.observation, no_index), (intervals.jump, no_index), (intervals.event, inserted_event)))
+        for a, b in ((intervals.observation, no_index), (intervals.jump, no_index),
+                     (intervals.event, jnp.append(no_index[:count], entries))))
     intervals = intervals_between(start, end, since_end - since, observation, jump, scale=scale, event=event)
     return grid._replace(intervals=intervals, lengths=None, observed=position[jnp.asarray(grid.observed)],
                          requested=position[jnp.asarray(grid.requested)], since=since)
+
+
+def _order_at_equal_times(intervals: Intervals, events: EventTable, index: np.ndarray,
+                          count: int) -> tuple[jax.Array, jax.Array]:
+    """Return the event at the end of each interval, and its rank beside an observation, as keys of a sort.
+
+    The intervals of the grid come first, then ``count`` that end at breakpoints, then those at the inserted events
+    ``index``. Events of one rank keep the order of the model. A jump of the forces needs no rank, because it commutes
+    with the events of the states.
+    """
+    event = jnp.concatenate([jnp.asarray(intervals.event), np.full(count, NO_EVENT), index])
+    rank_of_event = np.append(np.where(events.observation_first, EVENT_AFTER, EVENT_BEFORE), OBSERVATION)
+    return event, jnp.asarray(rank_of_event)[event]

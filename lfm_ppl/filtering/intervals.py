@@ -31,7 +31,8 @@ class Intervals(NamedTuple):
         length_index: (N,) index of its length in `TimeGrid.lengths`; zero where that is None.
         end: (N,) time at which the interval ends, exactly the time of its observation.
         inset: (N,) how far inside of the interval functions of time are evaluated at its ends, see `Span`.
-        event: (N,) index of the event of the model at its end, before the observation; -1 where there is none.
+        event: (N,) index of the event of the model at its end, before the observation; `NO_EVENT`, which is -1, where
+            there is none.
         state_map: the maps of these events; None where they are not needed, or without events.
         transition: exact transition of each interval, see `with_transitions`; None where it is tabulated by length.
     """

@@ -261,8 +261,9 @@ def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int,
     smoothed = backward(problem, trace)
     at_data, left_out = at_intervals((trace._replace(initial=None), smoothed.leave_one_out), problem.grid.observed)
     residual = whitened_innovations(at_data, y)
+    log_likelihood = jnp.where(jnp.isnan(at_data.log_likelihood), -jnp.inf, at_data.log_likelihood)
     return trace, smoothed.moments, {
-        "log_likelihood": at_data.log_likelihood, "leave_one_out": left_out, "whitened_innovation": residual,
+        "log_likelihood": log_likelihood, "leave_one_out": left_out, "whitened_innovation": residual,
         "change": change, "log_likelihood_change": at_data.log_likelihood.sum() - previous,
         "converged": jnp.asarray(True)}
 

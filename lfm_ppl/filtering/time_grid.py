@@ -7,7 +7,7 @@
    requested times takes its share of the steps.
 4. All intervals have the same number of steps, chosen to minimise the cost; a long part is several intervals.
 5. Group the lengths of the intervals, up to their rounding, so that their transitions are tabulated.
-6. Breakpoints and events at a traced lag are merged into the intervals by sorting.
+6. Breakpoints and events at a traced lag are merged into the intervals by sorting, in the same order at equal times.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def lay_out_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: fl
         checks.positive("tolerance", tolerance)
     events = event_table(ssm.model.events)
     if initial_time is not None:
-        events = events.exclude_past(initial_time)
+        events = events._replace(start=initial_time)
     initial_time = ssm.model.initial_time if initial_time is None else initial_time
     concrete_times = check_times(times, initial_time)
     start = concrete_times[0] if initial_time is None and concrete_times is not None else initial_time
@@ -139,7 +139,7 @@ def _concrete_layout(ssm: StateSpaceModel, times: np.ndarray, origin: float, req
         scale=0.0 if checks.traced(scale) else scale,
         overhead=OVERHEAD_OF_EXACT if ssm.time_invariant else OVERHEAD,
         is_exact=ssm.mean_invariant and division.max_step is None and not division.interval_per_step)
-    check_start(events.times, origin)
+    check_start(events.times[~np.asarray(events.is_past(events.times))], origin)
     grid = _divide_times(times, origin, ssm.stack.jump_times, requested, division, events)
     is_lagged = tuple(checks.traced(read.breakpoints()) for read in reads)
     return GridLayout(grid, tuple(read.breakpoint_rows for read in reads), is_lagged,
@@ -242,7 +242,8 @@ def _divide_times(times: np.ndarray, origin: float, jumps: tuple[float, ...], re
     # A particle smoother looks at each step: a jump has an interval of its own, so that the state just before it is a
     # node.
     before_jump = jump_time if division.interval_per_step else jump_time[:0]
-    event_index = np.flatnonzero(events.times <= end)
+    is_past = np.asarray(events.is_past(events.times))
+    event_index = np.flatnonzero((events.times <= end) & ~is_past)
     event_rank = np.where(events.observation_first[event_index], EVENT_AFTER, EVENT_BEFORE)
     time = np.concatenate([before_jump, jump_time, times, events.times[event_index]])
     rank = np.append(np.repeat([BEFORE_JUMP, JUMP, OBSERVATION], [len(before_jump), len(jump_time), len(times)]),

@@ -69,20 +69,42 @@ def _interval_in_words(distribution: Any, entries: Any = ...) -> str:
     base = _unwrapped(distribution)
     if base.support.is_discrete:
         return _in_words(base)
-    try:
-        quantiles = np.asarray(_quantiles(base))
-    except (NotImplementedError, ImportError, AttributeError):  # no closed form: draws give two digits
-        try:
-            draws = base.sample(jax.random.key(0), (_DRAWS,))
-        except NotImplementedError:  # an improper prior
-            return _in_words(base)
-        quantiles = np.vectorize("{:.2g}".format)(np.quantile(draws, _INTERVAL, axis=0)).astype(float)
-    median, low, high = (_number(np.broadcast_to(value, distribution.shape())[entries]) for value in quantiles)
+    quantiles = _quantiles_or_draws(base)
+    if quantiles is None:
+        return _in_words(base)
+    median, low, high = (_number(np.broadcast_to(value, distribution.shape())[entries]) for value in quantiles[:3])
     return f"median {median}, 95% {low} to {high} ({type(base).__name__})"
 
 
-_INTERVAL = (0.5, 0.025, 0.975)
-"""Probabilities of the median and of the ends of the 95% interval."""
+def central_interval(distribution: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the ends of the central 99% of a prior, entry by entry; None where it has no such interval.
+
+    Example:
+        >>> import numpyro.distributions as dist
+        >>> [round(float(end), 2) for end in central_interval(dist.Normal(1.0, 1.0))]
+        [-1.58, 3.58]
+    """
+    base = _unwrapped(distribution)
+    if isinstance(distribution, Pinned) or base.support.is_discrete:
+        return None
+    quantiles = _quantiles_or_draws(base)
+    return None if quantiles is None else (quantiles[3], quantiles[4])
+
+
+def _quantiles_or_draws(base: Any) -> np.ndarray | None:
+    """Return the quantiles (5, ...) of a distribution of single entries; None of an improper one."""
+    try:
+        return np.asarray(_quantiles(base))
+    except (NotImplementedError, ImportError, AttributeError):  # no closed form: draws give two digits
+        try:
+            draws = base.sample(jax.random.key(0), (_DRAWS,))
+        except NotImplementedError:
+            return None
+        return np.vectorize("{:.2g}".format)(np.quantile(draws, _INTERVAL, axis=0)).astype(float)
+
+
+_INTERVAL = (0.5, 0.025, 0.975, 0.005, 0.995)
+"""Probabilities of the median and of the ends of the intervals of 95% and 99%."""
 
 _DRAWS = 20_000
 """Number of draws for the quantiles of a prior without closed form."""
@@ -90,7 +112,7 @@ _DRAWS = 20_000
 
 @jax.jit
 def _quantiles(distribution: Any) -> jax.Array:
-    """Return the quantiles (3, ...); compiled, because `fit_many` describes the same priors for each data set."""
+    """Return the quantiles (5, ...); compiled, because `fit_many` describes the same priors for each data set."""
     return jax.vmap(distribution.icdf)(jnp.array(_INTERVAL))
 
 

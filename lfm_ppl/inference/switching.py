@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.breakdown import FilterWarning
-from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid
+from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid, with_state_maps
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -86,7 +86,7 @@ class Switching(SeriesLikelihood):
 
     Args:
         models: name of a regime -> its `LatentForceModel`. All have the same states, forces and outputs by name, linear
-            observations or not, and Gaussian noise.
+            observations or not, Gaussian noise, and the same events.
         rates: (K, K), rates of the transitions from regime i (row) to regime j, in 1/(unit of time), in the order of
             ``models``; zero on the diagonal, or with rows that sum to zero. They may be sampled.
         times: (T,), non-decreasing.
@@ -274,7 +274,7 @@ class Switching(SeriesLikelihood):
         """Simulate the real model: (x, indicators of the regimes, u) (T, M + K + R), and observations (T, D)."""
         ssms, times = self.ssms, np.asarray(self.times, float)
         initial_key, path_key = jax.random.split(key)
-        grid = self._grid(None, SIMULATION_STEPS * self.steps)
+        grid = with_state_maps(ssms[0], self._grid(None, SIMULATION_STEPS * self.steps))
         distinct = np.unique(times)
         # The decision at the last time has no consequences.
         chain = MarkovChain(distinct, transition_matrices(self.rates, jnp.diff(distinct, append=distinct[-1])))

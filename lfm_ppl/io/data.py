@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lfm_ppl.io import dosing
 from lfm_ppl.io import table as tables
 from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, Data, InputTable, fill_blanks
 from lfm_ppl.io.data_set import stack_series as stack_series
@@ -31,7 +32,10 @@ def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column
         inputs: columns of known inputs; or a mapping column -> "previous" (a value holds until the next, the default)
             or "linear" (values are joined by lines), which interpolate over empty cells and warn of them; or "zero",
             which is "previous" with empty cells read as zero; or "dose:STATE", doses to a state in the rows with a
-            number (see `lfm_ppl.Dose`). A row at the time of another row that has a value counts as filled.
+            number (see `lfm_ppl.Dose`), "dose:STATE,STATE" to the states that CMT numbers, "dose:STATE:once" one dose
+            that the column repeats. With doses, columns named EVID, MDV, ADDL, II, CMT, RATE, DUR and SS, in any case,
+            have the meaning of `lfm_ppl.io.dosing`; "CMT" and so on give a column of another name this meaning. A row
+            at the time of another row that has a value counts as filled.
         time_unit: unit of times that are dates (ms, s, min, h, d, weeks, years). None: that of the time between rows.
         usual_unit: the default of ``time_unit``, the unit of a model.
         observed: whether a file without any value of the outputs is an error; known inputs of the future have none.
@@ -134,6 +138,11 @@ def write_csv(data: Data, path: str | Path) -> None:
 
 def _doses_in_rows(name: str, table: InputTable, times: np.ndarray) -> np.ndarray:
     """Return doses (T,) in the first row of their times, NaN elsewhere."""
+    has_other_states = table.compartments is not None and table.compartments.any()
+    if (has_other_states or table.durations is not None or table.resets is not None
+            or len(np.unique(table.times)) < len(table.times)):
+        raise ValueError(f"the doses {name!r} have several states, infusions, resets or two doses at one time, which "
+                         "one column of amounts does not hold; keep the file that they come from.")
     rows = np.searchsorted(times, table.times)
     if not np.isin(table.times, times).all():
         raise ValueError(f"the doses {name!r} need rows at their times; add rows of missing observations there.")
@@ -152,10 +161,14 @@ def _read(table: Table, outputs: Sequence[str] | None, time_column: str | None,
         if isinstance(value, str):
             raise TypeError(f"{argument} must be a sequence of column names, such as [{value!r}], got {value!r}.")
     interpolations = dict(inputs) if isinstance(inputs, Mapping) else dict.fromkeys(inputs, "previous")
+    has_doses = any(way.startswith(DOSE) for way in interpolations.values())
+    events = dosing.event_columns(table, interpolations, outputs or ()) if has_doses or outputs else {}
+    interpolations = {name: way for name, way in interpolations.items() if way not in dosing.ROLES}
     time_name = _time_column(table, time_column)
     columns = [name for name in table.frame if name != time_name]
     names = list(outputs) if outputs is not None else [
-        name for name in columns if name and name not in interpolations and name.lower() != "replicate"]
+        name for name in columns if name and name not in interpolations and name.lower() != "replicate"
+        and name not in events.values()]
     for kind, requested in (("output", names), ("input", interpolations)):
         for name in requested:
             if name not in columns:
@@ -165,15 +178,19 @@ def _read(table: Table, outputs: Sequence[str] | None, time_column: str | None,
         raise ValueError(f"{table.label}: expected at least one output column beside the time {time_name!r}, and each "
                          f"column once, as an output or an input; got the outputs {names} and the inputs "
                          f"{list(interpolations)}.")
-    free = set(columns) - {*interpolations, *(outputs or ())} if not part else set()
+    free = set(columns) - {*interpolations, *events.values(), *(outputs or ())} if not part else set()
     times, unit, origin = _times(table, time_name, time_unit, usual_unit, [name for name in columns if name in free])
     y = np.column_stack([table.numbers(name) for name in names])
+    y[dosing.is_unobserved(table, events)] = np.nan
     if observed and np.isnan(y).all():
         raise ValueError(f"{table.label}: every value of {', '.join(names)}{part} is missing; expected a number.")
     for name, column in zip(names, y.T, strict=True):
         warn_of_codes(table, name, column)
+    doses = {name: way for name, way in interpolations.items() if way.startswith(DOSE)}
+    dose_tables = dosing.read_doses(table, doses, times, events, part) if doses else {}
     return Data(times, y, tuple(names), units={"time": unit} if unit else {}, origin=origin, inputs={
-        name: _input(table, name, interpolation, times) for name, interpolation in interpolations.items()})
+        name: dose_tables[name] if name in doses else _input(table, name, interpolation, times)
+        for name, interpolation in interpolations.items()})
 
 
 def _time_column(table: Table, time_column: str | None) -> str:
@@ -235,22 +252,17 @@ def _times(table: Table, name: str, unit: str | None, usual: str | None,
 
 def _input(table: Table, name: str, interpolation: str, times: np.ndarray) -> InputTable:
     """Return the column of a known input without its empty cells."""
-    is_dose = interpolation.startswith(DOSE)
-    if not is_dose:
-        checks.one_of(f"interpolation of {name}", interpolation, INTERPOLATIONS)
+    checks.one_of(f"interpolation of {name}", interpolation, INTERPOLATIONS)
     values = table.numbers(name)
     remedy = f"--inputs {name}:zero (inputs={{{name!r}: 'zero'}})"
-    if not is_dose and interpolation != "zero" and np.isnan(values[times == times[0]]).all():
+    if interpolation != "zero" and np.isnan(values[times == times[0]]).all():
         raise ValueError(f"{table.location(0, name)}: the known input has no value at the first time; fill the cell, "
                          f"or read empty cells as zero: {remedy}.")
     warn_of_codes(table, name, values)
     values = fill_blanks(f"{table.label}, column {name!r}", remedy, times, values, interpolation)
-    rows = np.flatnonzero(np.isfinite(values) & ~(is_dose & (values == 0)))
+    rows = np.flatnonzero(np.isfinite(values))
     unique_times, first, inverse = np.unique(times[rows], return_index=True, return_inverse=True)
     first_values = values[rows[first]]
-    if is_dose and (repeated := np.setdiff1d(np.arange(len(rows)), first)).size:
-        raise ValueError(f"{table.location(rows[repeated[0]], name)}: there are two doses at one time; write their sum "
-                         "in one row.")
     if (other_rows := rows[values[rows] != first_values[inverse]]).size:
         raise ValueError(f"{table.location(other_rows[0], name)}: the known input has another value at the same time.")
     return InputTable(unique_times, first_values, "previous" if interpolation == "zero" else interpolation)

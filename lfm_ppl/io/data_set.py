@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,7 +11,7 @@ import numpy as np
 from lfm_ppl.utils import calendar_time, checks
 
 if TYPE_CHECKING:
-    from lfm_ppl.model.events import Dose
+    from lfm_ppl.model.events import Event
     from lfm_ppl.model.inputs import Input
 
 
@@ -19,7 +19,7 @@ INTERPOLATIONS = ("previous", "linear", "zero")
 """How known inputs are read; "zero" is "previous" with blank cells read as zero."""
 
 DOSE = "dose:"
-"""Beginning of ``dose:STATE``, which reads a known input as doses to a state."""
+"""Beginning of ``dose:STATE,STATE``, which reads a known input as doses to states."""
 
 OF_SERIES = " of series "
 """Between the name of a known input and the label of its series in a panel."""
@@ -29,19 +29,69 @@ class InputTable(NamedTuple):
     """A known input as it was measured.
 
     Attributes:
-        times: (K,), increasing.
+        times: (K,), increasing; for doses not decreasing.
         values: (K,).
-        interpolation: "previous", "linear", or "dose:STATE" for doses.
+        interpolation: "previous", "linear", or "dose:STATE,STATE" for doses to these states.
+        durations: (K,), of doses that are infusions, zero for others; None: none is.
+        compartments: (K,), indices of the states that receive the doses; None: the first one receives all.
+        resets: (R,), times at which all states are set to zero, before a dose; None: none.
     """
 
     times: np.ndarray
     values: np.ndarray
     interpolation: str = "previous"
+    durations: np.ndarray | None = None
+    compartments: np.ndarray | None = None
+    resets: np.ndarray | None = None
 
     @property
-    def dosed_state(self) -> str:
-        """Name of the state that receives the values as doses; empty for a function of time."""
-        return self.interpolation.removeprefix(DOSE) if self.interpolation.startswith(DOSE) else ""
+    def is_dose(self) -> bool:
+        """Whether the values are doses, and not a function of time."""
+        return self.interpolation.startswith(DOSE)
+
+    @property
+    def dosed_states(self) -> tuple[str, ...]:
+        """Names of the states that receive the values as doses; empty for a function of time."""
+        return tuple(self.interpolation.removeprefix(DOSE).split(",")) if self.is_dose else ()
+
+    def on_clock(self, ratio: float, shift: float) -> InputTable:
+        """Return the table with times ``ratio * t + shift``."""
+        return self._replace(times=self.times * ratio + shift,
+                             durations=None if self.durations is None else self.durations * ratio,
+                             resets=None if self.resets is None else self.resets * ratio + shift)
+
+    def continued(self, later: InputTable) -> InputTable:
+        """Return the table up to the first time of a later one, followed by it."""
+        first = later.times.min(initial=np.inf)
+        if later.resets is not None:
+            first = min(first, later.resets.min(initial=np.inf))
+        is_earlier = self.times < first
+        joined = self._replace(times=np.append(self.times[is_earlier], later.times),
+                               values=np.append(self.values[is_earlier], later.values))
+        for name in ("durations", "compartments"):
+            mine, theirs = getattr(self, name), getattr(later, name)
+            if mine is not None or theirs is not None:
+                mine = np.zeros(len(self.times), int) if mine is None else mine
+                theirs = np.zeros(len(later.times), int) if theirs is None else theirs
+                joined = joined._replace(**{name: np.append(mine[is_earlier], theirs)})
+        if self.resets is not None or later.resets is not None:
+            mine, theirs = (np.zeros(0) if table.resets is None else table.resets for table in (self, later))
+            joined = joined._replace(resets=np.append(mine[mine < first], theirs))
+        return joined
+
+    def event_arrays(self) -> dict[tuple[str, str], tuple[np.ndarray, ...]]:
+        """Return the arrays of the doses as events: kind and state -> times, values and durations."""
+        arrays: dict[tuple[str, str], tuple[np.ndarray, ...]] = {}
+        if self.resets is not None and len(self.resets):
+            arrays["reset", ""] = self.resets, np.zeros(len(self.resets)), np.zeros(len(self.resets))
+        durations = np.zeros(len(self.times)) if self.durations is None else self.durations
+        compartments = np.zeros(len(self.times), int) if self.compartments is None else self.compartments
+        for index, state in enumerate(self.dosed_states):
+            for kind, is_kind in (("dose", durations == 0), ("infusion", durations > 0)):
+                rows = is_kind & (compartments == index)
+                if rows.any():
+                    arrays[kind, state] = self.times[rows], self.values[rows], durations[rows]
+        return arrays or {("dose", self.dosed_states[0]): (self.times, self.values, durations)}
 
 
 @dataclass(frozen=True)
@@ -59,7 +109,7 @@ class Data:
         inputs: known inputs: name -> (times, values) or (times, values, "linear"), or an `lfm.Input`; kept as
             `InputTable`. `known_inputs` gives them as functions of time. Missing values are left out, or with "zero"
             read as zero. (times, amounts, "dose:STATE") are doses to a state, which a model gets as `lfm.Dose` in its
-            argument ``events``.
+            argument ``events``. Those of a file may be infusions and resets, too.
         origin: the calendar time of t = 0 as ISO 8601 text, where the times were dates.
         series: labels of the B series of a panel; empty for one series.
 
@@ -119,15 +169,17 @@ class Data:
         """Return the known inputs as functions of time, for the ``inputs`` argument of a model."""
         return as_inputs(self.inputs)
 
-    def doses(self) -> list[Dose]:
-        """Return the doses among the known inputs, for the ``events`` argument of a model."""
-        return as_doses(self.inputs)
+    def doses(self) -> list[Event]:
+        """Return the doses, infusions and resets among the known inputs, for the ``events`` argument of a model."""
+        return as_events(self.inputs)
 
 
 def _input_table(name: str, value: Any, origin: str | None, unit: str) -> InputTable:
     """Return a known input, (times, values), (times, values, interpolation) or an `lfm.Input`, as a table."""
-    if all(hasattr(value, part) for part in InputTable._fields):  # an Input
-        value = tuple(getattr(value, part) for part in InputTable._fields)
+    if isinstance(value, InputTable) and value.is_dose:
+        return value
+    if all(hasattr(value, part) for part in InputTable._fields[:3]):  # an Input
+        value = tuple(getattr(value, part) for part in InputTable._fields[:3])
     if not (isinstance(value, tuple) and 2 <= len(value) <= 3):
         raise TypeError(f"the known input {name!r} must be (times, values), (times, values, interpolation) or an "
                         f"lfm.Input, got {type(value).__name__}.")
@@ -150,46 +202,74 @@ def as_inputs(tables: Mapping[str, InputTable]) -> dict[str, Input]:
     # Here and not before: arrays made before float64 is enabled stay in float32.
     from lfm_ppl.model.inputs import Input
 
-    functions = {name: table for name, table in tables.items() if not table.dosed_state}
-    return _by_name(functions, lambda name, table: Input(*table, name=name))
-
-
-def as_doses(tables: Mapping[str, InputTable]) -> list[Dose]:
-    """Return the doses among known inputs."""
-    from lfm_ppl.model.events import Dose
-
-    doses = {name: table for name, table in tables.items() if table.dosed_state}
-    return list(_by_name(doses, lambda name, table: Dose(table.times, table.values, table.dosed_state)).values())
-
-
-def _by_name(tables: Mapping[str, InputTable], make: Callable[[str, InputTable], Any]) -> dict[str, Any]:
-    """Return name -> ``make(name, table)``, stacked where each series of a panel has one."""
-    import jax
-
-    groups: dict[str, list[InputTable]] = {}
-    for name, table in tables.items():
-        groups.setdefault(name.partition(OF_SERIES)[0], []).append(table)
+    functions = {name: table for name, table in tables.items() if not table.is_dose}
     stacked = {}
-    for name, members in groups.items():
+    for name, members in _groups(functions).items():
         size = max(len(table.times) for table in members)
-        entries = [make(name, _padded(table, size)) for table in members]
-        stacked[name] = entries[0] if name in tables else jax.tree.map(lambda *leaves: np.stack(leaves), *entries)
+        entries = [Input(*_padded(table, size)[:3], name=name) for table in members]
+        stacked[name] = entries[0] if name in tables else _stack(entries)
     return stacked
 
 
+def as_events(tables: Mapping[str, InputTable]) -> list[Event]:
+    """Return the doses among known inputs as events; resets come before doses at the same time."""
+    events = []
+    for name, members in _groups({name: table for name, table in tables.items() if table.is_dose}).items():
+        arrays = [table.event_arrays() for table in members]
+        kinds = sorted({kind for part in arrays for kind in part}, key=lambda kind: (kind[0] != "reset", *kind))
+        for kind, state in kinds:
+            parts = [part.get((kind, state), (np.zeros(0),) * 3) for part in arrays]
+            entries = [_event(kind, state, *part) for part in _padded_events(kind, parts)]
+            events.append(entries[0] if name in tables else _stack(entries))
+    return events
+
+
+def _event(kind: str, state: str, times: np.ndarray, values: np.ndarray, durations: np.ndarray) -> Event:
+    from lfm_ppl.model.events import Dose, Infusion, Reset
+
+    if kind == "reset":
+        return Reset(times)
+    return Dose(times, values, state) if kind == "dose" else Infusion(times, values, state, duration=durations)
+
+
+def _padded_events(kind: str, parts: list[tuple[np.ndarray, ...]]) -> list[tuple[np.ndarray, ...]]:
+    """Return times, values and durations of the series of a panel with equally many events.
+
+    What is added never happens, or infuses nothing.
+    """
+    size = max(len(times) for times, _, _ in parts)
+    # The times of an infusion set the scale to which times are compared.
+    time = max(times.max(initial=0.0) for times, _, _ in parts) if kind == "infusion" else np.finfo(float).max
+    fills = time, 0.0, 1.0
+    return [tuple(np.append(array, np.full(size - len(array), fill)) for array, fill in zip(part, fills, strict=True))
+            for part in parts]
+
+
+def _groups(tables: Mapping[str, InputTable]) -> dict[str, list[InputTable]]:
+    """Return the tables by the name of the input; the series of a panel have one each."""
+    groups: dict[str, list[InputTable]] = {}
+    for name, table in tables.items():
+        groups.setdefault(name.partition(OF_SERIES)[0], []).append(table)
+    return groups
+
+
+def _stack(entries: Sequence[Any]) -> Any:
+    import jax
+
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *entries)
+
+
 def _padded(table: InputTable, size: int) -> InputTable:
-    """Return a table with ``size`` rows: the last value follows the last time, doses of zero a time without end."""
+    """Return a function of time with ``size`` rows; the last value follows the last time."""
     count = size - len(table.times)
-    if table.dosed_state:
-        times, value = np.full(count, np.finfo(float).max), 0.0
-    else:
-        times, value = table.times[-1] + np.arange(1, count + 1), table.values[-1]
-    return table._replace(times=np.append(table.times, times), values=np.append(table.values, np.full(count, value)))
+    times = table.times[-1] + np.arange(1, count + 1)
+    return table._replace(times=np.append(table.times, times),
+                          values=np.append(table.values, np.full(count, table.values[-1])))
 
 
 def model_keywords(tables: Mapping[str, InputTable], model_kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the keyword arguments of a model: those given, and ``inputs`` and ``events`` where the data have any."""
-    from_data = {"inputs": as_inputs(tables), "events": as_doses(tables)}
+    from_data = {"inputs": as_inputs(tables), "events": as_events(tables)}
     return {**{name: value for name, value in from_data.items() if value}, **(model_kwargs or {})}
 
 
@@ -206,7 +286,7 @@ def at_origin(data: Data, origin: str, unit: str) -> Data:
     truth = data.truth
     if truth is not None and truth.get("times") is not None:
         truth = {**truth, "times": np.asarray(truth["times"], float) * ratio + shift}
-    inputs = {name: table._replace(times=table.times * ratio + shift) for name, table in data.inputs.items()}
+    inputs = {name: table.on_clock(ratio, shift) for name, table in data.inputs.items()}
     return replace(data, times=data.times * ratio + shift, truth=truth, origin=origin, inputs=inputs,
                    units={**data.units, "time": unit})
 

@@ -22,7 +22,7 @@ A file that calls `lfm.panel` is fitted to several series together: ``model`` ge
 shorter series are padded.
 
 A ``model`` with an argument ``outputs``, ``units``, ``inputs`` or ``events`` gets the names of the outputs, the units,
-the known inputs (name -> `lfm.Input`) or the doses (a list of `lfm.Dose`) of the data.
+the known inputs (name -> `lfm.Input`) or the doses (a list of `lfm.Dose`, `lfm.Infusion` and `lfm.Reset`) of the data.
 """
 
 from __future__ import annotations
@@ -108,10 +108,10 @@ class ModelFile:
         from_data = {"outputs": data.outputs, "units": dict(data.units), "inputs": data.known_inputs(),
                      "events": data.doses()}
         for name, table in data.inputs.items():
-            argument, kind = ("events", "doses") if table.dosed_state else ("inputs", "known input")
+            argument, kind = ("events", "doses") if table.is_dose else ("inputs", "known input")
             if argument not in parameters:
                 raise ValueError(f"{self.path}: the data have the {kind} {name!r}, and model(...) has no argument "
-                                 f"`{argument}` to take {'them' if table.dosed_state else 'it'} by.")
+                                 f"`{argument}` to take {'them' if table.is_dose else 'it'} by.")
         for name in self.inputs:
             if name not in {key.partition(OF_SERIES)[0] for key in data.inputs}:
                 raise ValueError(f"{self.name} needs the known input {name!r}, which the data do not have.")

@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.forces.sde import Force
-from lfm_ppl.model.events import Event
+from lfm_ppl.model.events import Event, Infusion
 from lfm_ppl.model.gaussian import Gaussian
-from lfm_ppl.model.inputs import InputRead, check_reads, has_inputs, input_reads
+from lfm_ppl.model.inputs import Input, InputRead, check_reads, has_inputs, input_reads
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.time_degree import degree_in_time
@@ -55,7 +55,7 @@ class LatentForceModel(eqx.Module):
         deterministics: name -> ``(x, u, t) -> ()``, functions of state and forces, such as a rate ``softplus(u)``, a
             flow or a reproduction number. Results contain their trajectories and plot them, like
             ``numpyro.deterministic`` for parameters; they do not change the likelihood.
-        events: jumps of the state at given times, `Dose` and `Reset`; none by default.
+        events: what happens to the state at given times, `Dose`, `Infusion` and `Reset`; none by default.
 
     Functions that take a built model (`lfm.filter`, `lfm.smooth`, ...) read f, h and the others once for each model, as
     `jax.jit` does: where a variable that they read has changed, build the model again.
@@ -88,6 +88,7 @@ class LatentForceModel(eqx.Module):
     process_noise: Any
     initial_time: Any
     events: tuple[Event, ...]
+    infusions: tuple[tuple[Any, Input], ...]
     force_names: tuple[str, ...] = eqx.field(static=True)
     deterministics: dict[str, Callable[..., jax.Array]]
     deterministic_names: tuple[str, ...] = eqx.field(static=True)
@@ -131,6 +132,8 @@ class LatentForceModel(eqx.Module):
         if overlap := set(self.state_names) & set(self.force_names):
             raise ValueError(f"the name {sorted(overlap)[0]!r} is used for a state and for a force; rename one.")
         self.events = _events(events, self.state_names)
+        self.infusions = tuple((event.direction_in(self.state_names), event.rate_of_change())
+                               for event in self.events if isinstance(event, Infusion) and len(event.times))
         self.process_noise = own_functions(process_noise if callable(process_noise)
                                            else _dispersion(process_noise, size))
         self.deterministics = own_functions(_functions(deterministics, {*self.state_names, *self.force_names}))
@@ -150,6 +153,13 @@ class LatentForceModel(eqx.Module):
         if self.initial_time is not None or not any(
                 function.depends_on_time for name, function in functions.items() if not name.startswith("determin")):
             self._check_finite(self.initial_time)
+
+    def drift(self, x: jax.Array, u: jax.Array, t: Any) -> jax.Array:
+        """Return dx/dt (M,): the dynamics, and the infusions, whose rates are constant between their ends."""
+        change = self.dynamics(x, u, t)
+        for direction, rate in self.infusions:
+            change = change + direction * rate(t)
+        return change
 
     @property
     def units(self) -> dict[str, str]:
@@ -268,12 +278,16 @@ class LatentForceModel(eqx.Module):
     def input_reads(self, first: float, last: float) -> list[InputRead]:
         """Return the reads of known inputs between observations, see `lfm_ppl.model.inputs.input_reads`."""
         functions = _integrated_functions(self.traced_functions()) if self._has_integrated_inputs else []
-        return input_reads(functions, first, last)
+        # Inside of compiled code arithmetic on JAX arrays would give tracers.
+        tables = [[part if checks.traced(part) else np.asarray(part) for part in (rate.times, rate.values)]
+                  for _, rate in self.infusions]
+        of_infusions = [InputRead("previous", *table, 1.0, 0.0) for table in tables]
+        return input_reads(functions, first, last) + of_infusions
 
     @property
     def has_quadratic_inputs(self) -> bool:
         """Whether what is integrated is at most quadratic in time, between breakpoints of its known inputs."""
-        return all(degree_in_time(function) <= 2.0 for function in _integrated_functions(self._trace_functions()))
+        return all(degree_in_time(function) <= 2.0 for function in _integrated_functions(self.traced_functions()))
 
     def _check_finite(self, time: Any) -> None:
         """Evaluate the functions at the prior mean, if it is concrete; ``time`` is None if it does not matter."""
@@ -393,7 +407,8 @@ def _events(events: Sequence[Event], state_names: Sequence[str]) -> tuple[Event,
     events = (events,) if isinstance(events, Event) else tuple(events)
     for event in events:
         if not isinstance(event, Event):
-            raise TypeError(f"events must contain lfm.Dose and lfm.Reset, got {type(event).__name__}.")
+            raise TypeError("events must contain lfm.Dose, lfm.Infusion and lfm.Reset, got "
+                            f"{type(event).__name__}.")
         event.check_target(state_names)
     return events
 

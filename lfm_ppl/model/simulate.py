@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.model.events import StateMap, check_start, event_table
+from lfm_ppl.model.events import NO_EVENT, StateMap, check_start, event_table
 from lfm_ppl.model.inputs import breakpoints_within
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import noisy_observation
@@ -223,8 +223,8 @@ def _time_nodes(ssm: StateSpaceModel, start: jax.Array, times: jax.Array, breakp
 
     ``has_state``: whether the state at the start is given, so that events before an observation there have happened.
     """
-    events = event_table(ssm.model.events)
-    event_times = jnp.asarray(events.all_times)
+    events = event_table(ssm.model.events)._replace(start=start if has_state else None)
+    event_times, entries = events.entries_within(start, times[-1])
     breakpoints = jnp.concatenate([jnp.asarray(breakpoints, float), event_times])
     count, breakpoint_count = times.shape[0], breakpoints.shape[0]
     if not breakpoint_count:
@@ -238,14 +238,13 @@ def _time_nodes(ssm: StateSpaceModel, start: jax.Array, times: jax.Array, breakp
     fractions = np.arange(1, pieces) / pieces
     subdivisions = (interval_starts[:, None] + (times - interval_starts)[:, None] * fractions).ravel()
     nodes = jnp.concatenate([times, subdivisions, jnp.clip(breakpoints, start, times[-1])])
-    is_first = np.logical_not(events.observation_first)
-    happens = jnp.where(is_first & has_state, event_times > start, event_times >= start) & (event_times <= times[-1])
     other_count = nodes.shape[0] - event_times.shape[0]
-    rank = jnp.append(np.zeros(other_count, int), jnp.where(happens & is_first, -1, 1))
+    is_first = np.logical_not(events.observation_first) & (entries >= 0)
+    rank = jnp.append(np.zeros(other_count, int), jnp.where(is_first, -1, 1))
     order = jnp.lexsort((rank, jax.lax.stop_gradient(nodes)))
     maps = ssm.state_maps()
     if maps is not None:
-        index = jnp.append(np.full(other_count, -1), jnp.where(happens, np.arange(len(is_first)), -1))[order]
+        index = jnp.append(np.full(other_count, NO_EVENT), entries)[order]
         maps = jax.tree.map(lambda a: a[index], maps)
     return TimeNodes(nodes[order], jnp.argsort(order)[:count], order, steps_per_piece, maps)
 

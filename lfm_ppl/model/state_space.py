@@ -100,9 +100,9 @@ class StateSpaceModel(eqx.Module):
         return w[: self.physical_dim], w[self.physical_dim:]
 
     def drift(self, w: jax.Array, t: Any) -> jax.Array:
-        """Return f (M,)."""
+        """Return f (M,), infusions included."""
         x, u = self.split(w)
-        return jnp.asarray(self.model.dynamics(x, u, t), float)
+        return jnp.asarray(self.model.drift(x, u, t), float)
 
     def dispersion(self, w: jax.Array, t: Any) -> jax.Array | None:
         """Return G (M, S), or None without process noise."""
@@ -169,7 +169,7 @@ def state_space(model: LatentForceModel) -> StateSpaceModel:
     def on_inputs(function: Callable[..., Any]) -> Callable[[jax.Array], jax.Array]:
         return lambda v: jnp.ravel(jnp.asarray(function(v[:size], v[size:total], v[total]), float))
 
-    drift = pattern(on_inputs(model.dynamics), total + 1)
+    drift = pattern(on_inputs(model.drift), total + 1)
     extra = _dependence(on_inputs(model.process_noise), total) if callable(model.process_noise) else ()
     observe = pattern(on_inputs(model.observation.function), total + 1)
     varying = (_dependence(on_inputs(model.observation.covariance), total)

@@ -22,13 +22,26 @@ ORIGIN = "time_origin"
 """Attribute of a result: the calendar time of t = 0 as ISO 8601 text."""
 
 
+_PARTS = {"durations": "duration", "compartments": "compartment", "resets": "reset"}
+"""Further fields of a table of doses -> endings of the names of their coordinates."""
+
+
 def to_dataset(inputs: Mapping[str, InputTable], units: Mapping[str, str] | None = None) -> xr.Dataset:
-    """Return known inputs, each over times of its own, with the units of those that have one."""
-    return xr.Dataset(
-        {name: (f"{name}_time", np.asarray(table.values),
-                {"interpolation": table.interpolation, **units_attribute([name], units)})
-         for name, table in inputs.items()},
-        {f"{name}_time": np.asarray(table.times) for name, table in inputs.items()})
+    """Return known inputs, each over times of its own, with the units of those that have one.
+
+    Doses have their number and their sum as attributes, and lengths of infusions, states and resets as coordinates.
+    """
+    variables, coordinates = {}, {}
+    for name, table in inputs.items():
+        attributes = {"interpolation": table.interpolation, **units_attribute([name], units)}
+        if table.is_dose:
+            attributes |= {"doses": len(table.times), "total": float(np.sum(table.values))}
+        variables[name] = f"{name}_time", np.asarray(table.values), attributes
+        coordinates[f"{name}_time"] = np.asarray(table.times)
+        for field, ending in _PARTS.items():
+            if (values := getattr(table, field)) is not None:
+                coordinates[f"{name}_{ending}"] = f"{name}_{'reset' if field == 'resets' else 'time'}", values
+    return xr.Dataset(variables, coordinates)
 
 
 def inputs_of(result: Any, group: str = GROUP) -> dict[str, InputTable]:
@@ -36,9 +49,14 @@ def inputs_of(result: Any, group: str = GROUP) -> dict[str, InputTable]:
     if not arviz_data.has_group(result, group):
         return {}
     stored = arviz_data.group(result, group)
-    return {str(name): InputTable(np.asarray(stored[f"{name}_time"].values, float), np.asarray(variable.values, float),
-                                  str(variable.attrs.get("interpolation", "previous")))
-            for name, variable in stored.data_vars.items()}
+    tables = {}
+    for name, variable in stored.data_vars.items():
+        parts = {field: np.asarray(stored[f"{name}_{ending}"].values)
+                 for field, ending in _PARTS.items() if f"{name}_{ending}" in stored.coords}
+        tables[str(name)] = InputTable(
+            np.asarray(stored[f"{name}_time"].values, float), np.asarray(variable.values, float),
+            str(variable.attrs.get("interpolation", "previous")), **parts)
+    return tables
 
 
 def input_unit(result: Any, name: str) -> str:

@@ -14,7 +14,7 @@ import xarray as xr
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.likelihood_site import LikelihoodSite
-from lfm_ppl.io.data_set import InputTable, as_doses, keywords_by_site, model_keywords
+from lfm_ppl.io.data_set import InputTable, as_events, keywords_by_site, model_keywords
 from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.results.likelihoods import LikelihoodProblem
 from lfm_ppl.results.series import TIMES, times_of
@@ -56,10 +56,10 @@ def keywords(result: Any, later: Mapping[str, Any] | None, overrides: Mapping[st
                                  for name in sites}) | dict(overrides or {})
     stored = inputs.inputs_of(result)
     doses = {name: InputTable(*value) for name, value in (later or {}).items()
-             if name in stored and stored[name].dosed_state}
+             if name in stored and stored[name].is_dose}
     arguments = model_keywords(stored, overrides)
     if doses:
-        arguments["events"] = as_doses(stored | doses)
+        arguments["events"] = as_events(stored | doses)
     for name, value in (later or {}).items():
         if name in doses:
             continue

@@ -12,7 +12,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from lfm_ppl.model.events import Event, Infusion
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
@@ -26,8 +28,8 @@ def check_models(models: Any) -> dict[str, LatentForceModel]:
 
     Raises:
         TypeError: not a mapping of names to latent force models.
-        ValueError: fewer than two; the models differ in states, forces, outputs, deterministics or initial times; a
-            force has a mean that is a function of time.
+        ValueError: fewer than two; the models differ in states, forces, outputs, deterministics, initial times or
+            events; a force has a mean that is a function of time.
     """
     if not isinstance(models, Mapping) or not all(isinstance(model, LatentForceModel) for model in models.values()):
         raise TypeError('models must map the names of the regimes to latent force models, {"calm": model1, "abrupt": '
@@ -40,6 +42,12 @@ def check_models(models: Any) -> dict[str, LatentForceModel]:
     initial_times = {name: model.initial_time for name, model in models.items()}
     if not checks.traced(list(initial_times.values())) and len({str(time) for time in initial_times.values()}) > 1:
         raise ValueError(f"the models of all regimes need one initial_time, got {initial_times}.")
+    events: list[tuple[list[Any], Any]] = [jax.tree.flatten(model.events) for model in models.values()]
+    first_leaves, first_structure = events[0]
+    for leaves, structure in events[1:]:
+        if structure != first_structure or not all(
+                np.array_equal(a, b) for a, b in zip(leaves, first_leaves, strict=True) if not checks.traced((a, b))):
+            raise ValueError("the models of all regimes need the same events, because the time grid is one for all.")
     for name, model in models.items():
         if any(callable(force.mean) for force in model.forces.values()):
             raise ValueError(f"the mean of a force of the regime {name!r} is a function of time; add it to the "
@@ -70,7 +78,7 @@ def joint_model(models: Mapping[str, LatentForceModel], probabilities: jax.Array
 
         return selected
 
-    drift = select([model.dynamics for model in members])
+    drift = select([model.drift for model in members])
     initial = Gaussian(jnp.concatenate([first.initial_state.mean, probabilities]),
                        jnp.pad(first.initial_state.covariance, (0, count)))
     return LatentForceModel(
@@ -88,7 +96,20 @@ def joint_model(models: Mapping[str, LatentForceModel], probabilities: jax.Array
         units={**first.units, **dict.fromkeys(models, "1")},
         deterministics={name: select([model.deterministics[name] for model in members])
                         for name in first.deterministic_names},
+        events=[_joint_event(event, first.state_names, count) for event in first.events],
     )
+
+
+def _joint_event(event: Event, state_names: Sequence[str], count: int) -> Event:
+    """Return an event of the state (x, indicators), which leaves the indicators as they are.
+
+    An infusion is part of the joint dynamics, and only its start remains.
+    """
+    direction = event.direction_in(state_names)
+    padded = (jnp if checks.traced(direction) else np).pad(direction, (0, count))
+    if isinstance(event, Infusion):
+        return Event(event.event_times, 0.0, padded, 0.0, True, False)
+    return Event(event.times, event.values, padded, event.lag, event.observation_first, event.is_reset)
 
 
 def _joint_noise(members: Sequence[LatentForceModel], size: int) -> Callable[..., jax.Array] | None:

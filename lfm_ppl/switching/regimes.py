@@ -190,8 +190,8 @@ def regime_transitions(rates: jax.Array, grid: TimeGrid) -> tuple[jax.Array, jax
         grid: the time grid.
     """
     if checks.traced((grid.intervals.observation, grid.observed)):
-        raise ValueError("times, or a lag of a known input, are traced values, but regimes need intervals that are "
-                         "known before compilation; give them as numbers.")
+        raise ValueError("times, a lag, or the length of an infusion are traced values, but regimes need intervals "
+                         "that are known before compilation; give them as numbers.")
     is_end = np.asarray(grid.intervals.observation) >= 0
     is_end[max(grid.observed) + 1:] = True
     is_start = np.append(True, is_end[:-1])

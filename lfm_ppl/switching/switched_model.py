@@ -90,6 +90,9 @@ def build_models(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ..
     models = [build(value) for value in rule.values]
     ssms = tuple(state_space(model) for model in models)
     check_structure({f"build({value:g})": ssm for value, ssm in zip(rule.values, ssms, strict=True)})
+    if any(ssm.model.events for ssm in ssms):
+        raise ValueError("the models have events, which a model that switches by a rule does not support; leave them "
+                         "out.")
     starts = [[checks.concrete(entry) for entry in (*ssm.initial(), ssm.model.initial_time)] for ssm in ssms]
     for value, start in zip(rule.values, starts, strict=True):
         pairs = zip(start, starts[0], strict=True)
@@ -108,8 +111,6 @@ def check_structure(ssms: Mapping[str, StateSpaceModel]) -> None:
                    "angular outputs": ssm.model.observation.angular, "a joint state of size": ssm.state_dim,
                    "jump times": ssm.stack.jump_times} for ssm in ssms.values()]
     for name, structure in zip(names, structures, strict=True):
-        if ssms[name].model.events:
-            raise ValueError(f"{name} has events, which a model that switches does not support; leave them out.")
         for kind, value in structure.items():
             if value != structures[0][kind]:
                 raise ValueError(f"{name} has {kind} {value}, and {first} has {structures[0][kind]}; models between "

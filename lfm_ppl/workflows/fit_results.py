@@ -37,6 +37,7 @@ from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, TrajectoryDraws, force_periods, lay_out
 from lfm_ppl.results.predictions import SHOWN_PERIODS, repeats_often
+from lfm_ppl.results.prior_conflict import prior_conflicts
 from lfm_ppl.results.sites import merge_sites
 from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
@@ -131,7 +132,7 @@ class PostProcessing:
         scores: of the observations by site, without the sites whose scores are not computed.
         trajectories: by site, see `draw_paths`.
         attributes: of the result.
-        warnings: on the likelihood.
+        warnings: on the likelihood and the priors.
         partial: the groups that a result has after Ctrl-C; None: all.
     """
 
@@ -168,6 +169,8 @@ def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint |
             processed.scores[name] = best_effort(label("scores of the observations", name), partial(
                 scores, score_keys[name], site.bound, values, **batch_options(label("scores", name))), None)
         processed.attributes = _site_attributes(problem, draws, values)
+        processed.warnings += best_effort("comparison with the priors", partial(
+            prior_conflicts, problem.bound, values), [])
         for name, site in problem.sites.items():
             warn(name, best_effort(label("resolution of the forces", name),
                                    partial(resolution_warnings, site.bound, values), []))

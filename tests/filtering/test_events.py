@@ -155,6 +155,66 @@ def test_gradients_of_amounts_and_lags_equal_finite_differences(is_linear):
     np.testing.assert_allclose(value, concrete, atol=1e-8 if is_linear else 5e-5)
 
 
+@pytest.mark.parametrize("observation_first", [True, False])
+@pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0]])
+def test_traced_lags_leave_the_order_of_events_as_it_is(observation_first, order):
+    times = np.array([0.3, 4.0, 5.0])
+
+    def moments(lag):
+        events = [lfm.Dose([0.0, 4.0], 10.0, "c", lag=lag, observation_first=observation_first),
+                  lfm.Reset([4.5, 0.8], "c", 1.0, lag=-0.5), lfm.Dose([4.0, 5.0], [3.0, 2.0], "c")]
+        model = decay([events[index] for index in order])
+        smoothed = lfm.smooth(model, times, np.ones((3, 1)), at=[0.0, 2.0, 4.0, 4.2, 5.0]).mean
+        density = lfm.MarginalLikelihood(model, times).log_prob(np.ones((3, 1)))
+        path = lfm.simulate(jax.random.key(0), model, times).state
+        return jnp.append(jnp.concatenate([smoothed, path])[:, 0], density)
+
+    np.testing.assert_allclose(jax.jit(moments)(0.0), moments(0.0), rtol=1e-12)
+
+
+def decay(events):
+    return lfm.LatentForceModel(
+        lambda x, u, t: -0.1 * x, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.ones(1)),
+        lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))), state_names=("c",), initial_time=0.0, events=events)
+
+
+@pytest.mark.parametrize("lag", [-0.5, np.nan])
+def test_an_event_before_the_initial_time_or_at_no_time_has_no_density(lag):
+    times, y = np.array([1.0, 5.0]), np.ones((2, 1))
+
+    def delayed(lag):
+        return decay([lfm.Dose([0.0, 3.0], 10.0, "c", lag=lag), lfm.Reset([4.0], "c")])
+
+    def log_prob(lag):
+        panel = lfm.panel(delayed, jnp.stack([lag, jnp.abs(lag)]), np.array([times, times + 0.5]))
+        return jnp.append(panel.log_prob(jnp.stack([y, y]))[0], lfm.MarginalLikelihood(delayed(lag), times).log_prob(y))
+
+    value, slope = jax.jit(lambda lag: jax.vjp(log_prob, lag)[0:2])(lag)
+    np.testing.assert_array_equal(value, -np.inf)
+    assert slope(jnp.ones(2))[0] == 0.0
+
+    def others(lag):
+        particles = lfm.particle_filter(jax.random.key(0), delayed(lag), times, y, particles=10)
+        return (lfm.filter(delayed(lag), times, y).log_likelihood.sum(), particles.log_likelihood.sum(),
+                lfm.smooth(delayed(lag), times, y).log_likelihood.sum(),
+                lfm.simulate(jax.random.key(0), delayed(lag), times).state.sum())
+
+    *densities, state = jax.jit(others)(lag)
+    np.testing.assert_array_equal(densities, -np.inf)
+    assert np.isnan(state)
+
+
+def test_a_filter_that_continues_includes_the_events_before_its_start():
+    times, y = np.array([1.0, 4.0, 5.0]), np.ones((3, 1))
+
+    def continued(lag):
+        model = decay([lfm.Dose([0.0, 4.0], 10.0, "c", lag=lag), lfm.Dose([4.0], 2.0, "c", lag, False)])
+        first = lfm.filter(model, times[:2], y[:2])
+        return lfm.filter(model, times[2:], y[2:], start=first.state).predicted_mean
+
+    np.testing.assert_allclose(jax.jit(continued)(0.0), continued(0.0), rtol=1e-12)
+
+
 def test_simulation_without_noise_is_the_mean():
     model = absorption(1.3, 0.2, [lfm.Dose(DOSES, AMOUNTS, "gut"), lfm.Reset([7.0], "blood", 1.0)])
     state = lfm.simulate(jax.random.key(0), model, TIMES, steps=100).state

@@ -56,7 +56,7 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
     _, end = forecasts.forecast_span(result)
     for axes, name in zip(panels, names, strict=True):
         table = tables[name]
-        if table.dosed_state:
+        if table.is_dose:
             _draw_doses(axes, table)
         else:
             _draw_function(axes, table, end)

@@ -1,0 +1,191 @@
+"""Dosing files against an independent simulation with matrix exponentials, and rows that are refused."""
+
+from __future__ import annotations
+
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import lfm_ppl as lfm
+from lfm_ppl.cli import choices
+from lfm_ppl.cli.options import Columns
+from lfm_ppl.io.data import read_csv, read_series
+from lfm_ppl.io.data_set import Data, stack_series
+from lfm_ppl.io.loading import load
+from lfm_ppl.results.arviz_data import build
+from lfm_ppl.results.inputs import GROUP, inputs_of, to_dataset
+
+ABSORPTION, ELIMINATION = 0.3, 0.1
+RATES = np.array([[-ABSORPTION, 0.0], [ABSORPTION, -ELIMINATION]])
+HEADER = "TIME,DV,AMT,EVID,MDV,CMT,RATE,dur,ADDL,II"
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(text, way="dose:gut,blood", **more):
+        path = tmp_path / "pk.csv"
+        path.write_text(text)
+        return read_csv(path, outputs=["DV"], inputs={"AMT": way, **more})
+
+    return read
+
+
+def random_file(seed):
+    """Return a file with all columns, and its doses (time, amount, state, duration) and resets."""
+    generator = np.random.default_rng(seed)
+    rows, doses, resets = [], [], []
+    for time in np.sort(generator.choice(np.arange(0.0, 48.0, 0.5), 16, replace=False)):
+        kind = generator.choice(["observation", "observation", "dose", "dose", "reset", "other"])
+        cells = dict.fromkeys(HEADER.split(","), ".") | {"TIME": time, "EVID": 0, "MDV": 0, "DV": 1.0}
+        if kind in ("dose", "reset"):
+            state, amount = generator.integers(2), float(generator.integers(20, 100))
+            duration, further, gap = 0.0, int(generator.integers(3)), 7.25
+            compartment = generator.choice([str(state + 1), ["gut", "blood"][state]])
+            cells |= {"EVID": 1, "MDV": 1, "AMT": amount, "CMT": compartment}
+            if kind == "reset":
+                resets.append(time)
+                cells["EVID"] = 4
+            if generator.random() < 0.5:
+                duration = float(generator.choice([0.75, 4.0, 10.0]))
+                cells |= {"RATE": repr(amount / duration)} if generator.random() < 0.5 else {"dur": duration}
+            if further:
+                cells |= {"ADDL": further, "II": gap}
+            doses += [(time + k * gap, amount, state, duration) for k in range(further + 1)]
+            if kind == "reset" and generator.random() < 0.5:
+                cells |= dict.fromkeys(("AMT", "CMT", "RATE", "dur", "ADDL", "II"), ".") | {"EVID": 3}
+                del doses[-further - 1:]
+        elif kind == "other":
+            cells |= {"EVID": generator.choice([0, 2]), "MDV": 1, "DV": 99.0}
+        rows.append(",".join(str(cells[name]) for name in HEADER.split(",")))
+    rows.append("49.0,1.0,.,0,0,.,.,.,.,.")
+    return "\n".join([HEADER, *rows, ""]), doses, resets
+
+
+def simulate(times, doses, resets):
+    """Return the state (T, 2) before the doses at each of the times."""
+    ends = {(t, a, s, d): min([t + d, *(r for r in resets if r > t)]) for t, a, s, d in doses}
+    marks = sorted({*times, *resets, *(dose[0] for dose in doses), *ends.values()})
+    state, now, states = np.zeros(2), 0.0, {}
+    for mark in marks:
+        generator = np.zeros((3, 3))
+        generator[:2, :2] = RATES
+        for (start, amount, index, duration), end in ends.items():
+            if duration and start <= now < end:
+                generator[index, 2] += amount / duration
+        state = (expm(generator * (mark - now)) @ np.append(state, 1.0))[:2]
+        now = mark
+        states[mark] = state
+        if mark in resets:
+            state = np.zeros(2)
+        for start, amount, index, duration in doses:
+            if start == mark and not duration:
+                state = state + amount * np.eye(2)[index]
+    return np.array([states[time] for time in times])
+
+
+def predicted(data):
+    model = lfm.LatentForceModel(
+        lambda x, u, t: jnp.asarray(RATES) @ x, {}, lfm.GaussianObservation(lambda x, u, t: x[1:], jnp.ones(1)),
+        lfm.Gaussian(jnp.zeros(2), jnp.zeros((2, 2))), state_names=("gut", "blood"), initial_time=0.0,
+        events=data.doses())
+    return np.asarray(lfm.filter(model, data.times, data.y, max_step=0.05).predicted_mean)
+
+
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 20))])
+def test_a_dosing_file_is_the_history_that_it_describes(seed, read):
+    text, doses, resets = random_file(seed)
+    data = read(text)
+    unobserved = np.array([row.split(",")[4] == "1" for row in text.splitlines()[1:]])
+    np.testing.assert_array_equal(np.isnan(data.y[:, 0]), unobserved)
+    np.testing.assert_allclose(predicted(data), simulate(data.times, doses, resets), atol=1e-8)
+    # Stored with a result, and read back.
+    stored = inputs_of(build({GROUP: to_dataset(data.inputs)}))["AMT"]
+    for mine, theirs in zip(stored, data.inputs["AMT"], strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_rows_without_evid_are_doses_where_they_have_an_amount(read):
+    data = read("TIME,DV,AMT,MDV\n0,0,320,1\n1,6.1,0,0\n24,0,320,1\n25,7.0,0,0\n", "dose:gut")
+    (dose,) = data.doses()
+    assert dose.times.tolist() == [0.0, 24.0] and dose.state == "gut"
+    np.testing.assert_array_equal(data.y[:, 0], [np.nan, 6.1, np.nan, 7.0])
+
+
+def test_a_column_of_another_name_has_the_role_that_it_is_given(read):
+    data = read("TIME,DV,AMT,where,rate\n0,,3,2,1\n1,2,,,5\n2,2,1,1,\n", where="CMT")
+    dose, infusion = data.doses()
+    assert (dose.state, infusion.state, infusion.durations.tolist()) == ("gut", "blood", [3.0])
+
+
+def test_resets_come_before_doses_and_end_infusions(read):
+    data = read(f"{HEADER}\n0,.,40,1,1,2,8,.,.,.\n2,.,5,4,1,1,.,.,.,.\n4,1,.,0,0,.,.,.,.,.\n")
+    reset, dose, infusion = data.doses()
+    assert reset.is_reset and reset.times.tolist() == [2.0] and reset.state is None
+    assert infusion.durations.tolist() == [2.0] and infusion.values.tolist() == [16.0]
+    assert dose.times.tolist() == [2.0]
+
+
+@pytest.mark.parametrize(("cells", "message"), [
+    ("AMT,SS,II\n3,1,12", "steady state"), ("AMT,RATE\n3,-2", "to be estimated"), ("AMT,RATE\n3,-1", "to be estimated"),
+    ("AMT,EVID\n3,2", "EVID 2 with a dose"), ("AMT,EVID\n3,0", "no dose"), ("AMT,EVID\n.,1", "no amount"),
+    ("AMT,EVID\n3,7", "EVID must be"), ("AMT\n-3", "negative"), ("AMT,CMT\n3,3", "compartment 3"),
+    ("AMT,CMT\n3,liver", "compartment liver"), ("AMT,ADDL\n3,2", "in II"),
+    ("AMT,ADDL,II\n3,1.5,2", "number of further"),
+    ("AMT,RATE,DUR\n3,1,1", "leave one"), ("AMT,DUR\n3,-1", "duration"), ("AMT,rate\n3,-7", "above zero"),
+])
+def test_rows_that_are_not_read_are_named(cells, message, read):
+    names, values = cells.split("\n")
+    with pytest.raises(ValueError, match=f"row 2, column.*{message}"):
+        read(f"TIME,DV,{names}\n0,.,{values}\n1,2,{','.join('.' * len(values.split(',')))}\n")
+
+
+REPEATED = "time,conc,dose\n0,0.7,320\n0.5,2.8,320\n1,6.6,320\n"
+
+
+def test_a_column_that_repeats_one_dose(tmp_path):
+    path = tmp_path / "theoph.csv"
+    path.write_text(REPEATED)
+    with pytest.warns(UserWarning, match="all 3 rows hold the same dose, so that 3 doses of 320 are given, 960 in all"):
+        data = read_csv(path, ["conc"], inputs={"dose": "dose:gut"})
+    stored = to_dataset(data.inputs)["dose"]
+    assert (stored.attrs["doses"], stored.attrs["total"]) == (3, 960.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data = read_csv(path, ["conc"], inputs={"dose": "dose:gut:once"})
+        table = data.inputs["dose"]
+        assert (table.times.tolist(), table.values.tolist(), table.interpolation) == ([0.0], [320.0], "dose:gut")
+        path.write_text("time,conc,dose,EVID\n0,.,320,1\n12,.,320,1\n24,.,320,1\n")
+        read_csv(path, ["conc"], inputs={"dose": "dose:gut"}, observed=False)
+    path.write_text(REPEATED.replace("1,6.6,320", "1,6.6,300"))
+    with pytest.raises(ValueError, match="several amounts"):
+        read_csv(path, ["conc"], inputs={"dose": "dose:gut:once"})
+
+
+def test_series_of_a_panel_have_infusions_and_resets_of_their_own(tmp_path):
+    path = tmp_path / "panel.csv"
+    path.write_text("ID,TIME,DV,AMT,RATE,EVID\n1,0,.,8,2,1\n1,5,1,.,.,0\n1,6,.,.,.,3\n2,1,.,4,.,1\n2,7,1,.,.,0\n")
+    panel = stack_series(read_series(path, "ID", ["DV"], inputs={"AMT": "dose:gut"}))
+    reset, dose, infusion = panel.doses()
+    assert reset.times[0].tolist() == [6.0] and infusion.values.tolist() == [[8.0], [0.0]]
+    assert dose.values.tolist() == [[0.0], [4.0]] and dose.times[1].tolist() == [1.0]
+
+
+def test_later_doses_continue_the_earlier_ones(read):
+    earlier = read("TIME,DV,AMT,RATE\n0,.,4,2\n6,1,.,.\n").inputs["AMT"]
+    later = read("TIME,DV,AMT,CMT\n8,.,3,2\n9,1,.,.\n").inputs["AMT"]
+    joined = earlier.continued(later)
+    assert joined.times.tolist() == [0.0, 8.0] and joined.durations.tolist() == [2.0, 0.0]
+    assert joined.compartments.tolist() == [0, 1]
+    events = Data([0.0], [[1.0]], ("DV",), inputs={"AMT": joined}).doses()
+    assert [(type(event).__name__, event.state) for event in events] == [("Dose", "blood"), ("Infusion", "gut")]
+
+
+def test_the_command_line_names_states_and_roles():
+    model = load("pharmacokinetics")
+    assert choices.inputs(Columns(events="AMT:gut"), model) == {"dose": ("AMT", "dose:gut")}
+    assert choices.inputs(Columns(events="AMT:gut,blood,where:CMT"), model) == {
+        "dose": ("AMT", "dose:gut,blood"), "where": ("where", "CMT")}
+    assert choices.inputs(Columns(events="dose:gut:once"), model) == {"dose": ("dose", "dose:gut:once")}
