@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,12 +29,12 @@ import scipy.linalg
 from lfm_ppl.filtering.breakdown import FilterWarning
 from lfm_ppl.filtering.dynamics import is_nonlinear_in_forces_only
 from lfm_ppl.filtering.intervals import EXPONENTIAL, Intervals, TimeGrid, as_arrays, with_state_maps
-from lfm_ppl.filtering.problem import has_exact_transitions
 from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import fastest_rate, matmul
+from lfm_ppl.utils.programs import shared_jit
 
 _LIMIT, _LINEAR_LIMIT = 2.5, 1.5
 """Largest product of step and rate, in the explicit part and in the linear part."""
@@ -104,10 +103,13 @@ class LongStep(NamedTuple):
     is_linear: bool
 
 
-def has_explicit_steps(ssm: StateSpaceModel, grid: TimeGrid) -> bool:
-    """Return whether the filter takes explicit steps of fixed length; adaptive ones are shortened by their error."""
-    is_explicit = grid.method != EXPONENTIAL and grid.tolerance is None
-    return bool(ssm.physical_dim) and is_explicit and not has_exact_transitions(ssm, grid)
+def has_explicit_steps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> bool:
+    """Return whether the filter takes explicit steps of fixed length; adaptive ones are shortened by their error.
+
+    Where only the forces enter non-linearly, no state is integrated explicitly (`lfm_ppl.filtering.simpson`).
+    """
+    is_explicit = grid.method != EXPONENTIAL and grid.tolerance is None and not ssm.has_constant_coefficients
+    return bool(ssm.physical_dim) and is_explicit and not is_nonlinear_in_forces_only(ssm, rule)
 
 
 def explicit_steps(ssm: StateSpaceModel, grid: TimeGrid, filtered_mean: jax.Array,
@@ -159,7 +161,7 @@ def explicit_steps(ssm: StateSpaceModel, grid: TimeGrid, filtered_mean: jax.Arra
     return jax.lax.scan(follow, start, intervals)[1]._replace(linear=linear[:, :size])
 
 
-_compiled_explicit_steps = eqx.filter_jit(explicit_steps)
+_compiled_explicit_steps = shared_jit(explicit_steps)
 
 
 def warn_of_long_steps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, steps: int, filtered_mean: Any,
@@ -177,23 +179,14 @@ def warn_of_long_steps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, steps: 
         log_likelihood: result of the filter, of any shape.
         initial_mean: (n,), at the initial time; None: the model's.
     """
-    if checks.traced((ssm, grid, log_likelihood, initial_mean)) or not has_explicit_steps(ssm, grid):
+    if checks.traced((ssm, grid, log_likelihood, initial_mean)) or not has_explicit_steps(ssm, rule, grid):
         return
-    if not np.isfinite(np.asarray(log_likelihood)).all() or is_slow(ssm, rule, grid):
+    if not np.isfinite(np.asarray(log_likelihood)).all():
         return
     mean = filtered_mean() if callable(filtered_mean) else filtered_mean
     long = long_step(_compiled_explicit_steps(ssm, grid, mean, initial_mean))
     if long is not None:
         checks.warn(long_step_message(long, ssm.model.state_names, steps), FilterWarning)
-
-
-def is_slow(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> bool:
-    """Return whether no state is integrated explicitly and the linear part is slow at the longest step."""
-    if not is_nonlinear_in_forces_only(ssm, rule):
-        return False
-    linear = np.asarray(linear_part(ssm, jnp.asarray(grid.initial_time, float)).rows[:, :ssm.physical_dim])
-    longest = float(np.max(np.asarray(grid.intervals.length), initial=0.0)) / grid.steps
-    return not longest * np.max(decay_rates(linear), initial=0.0) > _LINEAR_LIMIT
 
 
 def decay_rates(matrices: np.ndarray) -> np.ndarray:

@@ -108,7 +108,8 @@ class SharedState(Force):
 
 def _unit_derivatives(force: Stretched) -> np.ndarray:
     """Return O (n, n), the rows h F_1^k."""
-    unit, size = force.unit, force.state_dim
+    unit: Any = force.unit
+    size = force.state_dim
     first = unit.measurement if isinstance(force, SquaredExponential) else np.eye(size)[0]
     return np.stack([first @ np.linalg.matrix_power(unit.feedback, k) for k in range(size)])
 
@@ -124,7 +125,7 @@ def in_state_of(force: Force, reference: Force) -> Force:
         reference: a force of the same structure, see `structure_of`.
     """
     if isinstance(force, Stretched) and isinstance(reference, Stretched):
-        return force if force.state_dim == 1 or _is_equal(force, reference) else SharedState(force, reference)
+        return force if force.state_dim == 1 or _is_equal(force, reference) else SharedState(force, reference)  # type: ignore[call-arg]
     if isinstance(force, Sum) and isinstance(reference, Sum):
         return Sum(tuple(in_state_of(*pair) for pair in zip(force.forces, reference.forces, strict=True)))
     if isinstance(force, QuasiPeriodic) and isinstance(reference, QuasiPeriodic):

@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.dynamics import is_nonlinear_in_forces_only
-from lfm_ppl.filtering.stiffness import ExplicitSteps, has_explicit_steps, is_slow, long_step, long_step_message
+from lfm_ppl.filtering.stiffness import ExplicitSteps, has_explicit_steps, long_step, long_step_message
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.map_draws import map_series
-from lfm_ppl.inference.panel import Panel
+from lfm_ppl.utils.programs import Program
 
 
 def long_step_messages(bound: BoundModel, z: np.ndarray, has_method: bool = True) -> list[str]:
@@ -26,10 +25,9 @@ def long_step_messages(bound: BoundModel, z: np.ndarray, has_method: bool = True
     messages = []
     for name, site_model in bound.site_models.items():
         example = site_model.site.example
-        if len(example.ssms) > 1 or not has_explicit_steps(example.ssm, example.time_grid):
+        if len(example.ssms) > 1 or not has_explicit_steps(example.ssm, example.rule, example.time_grid):
             continue
-        steps = _explicit_steps(site_model, z)
-        long = None if steps is None else long_step(steps)
+        long = long_step(_explicit_steps(site_model, z))
         if long is not None:
             message = long_step_message(long, example.ssm.model.state_names, example.steps,
                                         has_method and "method" in example.settings)
@@ -37,15 +35,8 @@ def long_step_messages(bound: BoundModel, z: np.ndarray, has_method: bool = True
     return messages
 
 
-def _explicit_steps(bound: BoundModel, z: np.ndarray) -> ExplicitSteps | None:
-    example = bound.site.example
-    if not isinstance(bound.site.distribution, Panel) and is_nonlinear_in_forces_only(example.ssm, example.rule):
-        # No filter needs to be compiled where the steps cannot be too long.
-        likelihood = bound.likelihood(z)
-        if is_slow(likelihood.ssm, likelihood.rule, likelihood.time_grid):
-            return None
-
+def _explicit_steps(bound: BoundModel, z: np.ndarray) -> ExplicitSteps:
     def run(z: jax.Array, y: Any) -> Any:
         return map_series(bound.likelihood(z, y), lambda series, y: series.explicit_steps(y), bound.data(y))
 
-    return bound.program("explicit steps", lambda: jax.jit(run))(jnp.asarray(z, float), bound.arguments)
+    return bound.program("explicit steps", lambda: Program(run))(jnp.asarray(z, float), bound.arguments)

@@ -156,7 +156,7 @@ class Panel(dist.Distribution):
         """Warn where a step of a series is too long for a fast decay, outside of compiled code."""
         first = self.first
         if checks.traced((self.parameters, self.times, log_likelihood)) or not has_explicit_steps(
-                first.ssm, first.time_grid) or not np.isfinite(np.asarray(log_likelihood)).all():
+                first.ssm, first.rule, first.time_grid) or not np.isfinite(np.asarray(log_likelihood)).all():
             return
         long = long_step(self._explicit_steps(y))
         if long is not None:

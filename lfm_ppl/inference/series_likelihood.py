@@ -216,7 +216,7 @@ class SeriesLikelihood(dist.Distribution):
 
     def explicit_steps(self, y: jax.Array) -> ExplicitSteps | None:
         """Return what limits the explicit steps of the filter of ``y`` (T, D); None where there are none."""
-        if not has_explicit_steps(self.ssm, self.time_grid):
+        if not has_explicit_steps(self.ssm, self.rule, self.time_grid):
             return None
         # Linearised at the mean: the rates need no more, and this compiles fastest.
         result = filter_on(self.ssm, Taylor(), self.time_grid, y, jnp.asarray(self.times, float))

@@ -73,7 +73,7 @@ class InputTable(NamedTuple):
             if mine is not None or theirs is not None:
                 mine = np.zeros(len(self.times), int) if mine is None else mine
                 theirs = np.zeros(len(later.times), int) if theirs is None else theirs
-                joined = joined._replace(**{name: np.append(mine[is_earlier], theirs)})
+                joined = joined._replace(**{name: np.append(mine[is_earlier], theirs)})  # type: ignore[arg-type]
         if self.resets is not None or later.resets is not None:
             mine, theirs = (np.zeros(0) if table.resets is None else table.resets for table in (self, later))
             joined = joined._replace(resets=np.append(mine[mine < first], theirs))

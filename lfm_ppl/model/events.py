@@ -185,7 +185,8 @@ class Infusion(Event):
         super().__init__(times, amounts, target, lag, True, False)
         if (rate is None) == (duration is None):
             raise ValueError("an infusion needs either rate= or duration=, and not both.")
-        name, value = ("duration", duration) if rate is None else ("rate", rate)
+        name = "duration" if rate is None else "rate"
+        value: Any = duration if rate is None else rate
         checks.positive(f"{name} of an infusion", value)
         if np.shape(value) not in ((), np.shape(times)):
             raise ValueError(f"{name} of an infusion must be one number or one for each of the {np.size(self.times)} "
@@ -225,7 +226,7 @@ class Infusion(Event):
         rates = self.rates + np.zeros(np.shape(self.times))
         changes = _concatenate(rates, -rates)
         if checks.traced(switch_times):
-            order = jnp.argsort(jax.lax.stop_gradient(switch_times))
+            order: Any = jnp.argsort(jax.lax.stop_gradient(switch_times))
             times, values = switch_times[order], jnp.asarray(changes)[order].cumsum()
         else:
             # The times of the table of an input increase.

@@ -279,10 +279,11 @@ class LatentForceModel(eqx.Module):
         """Return the reads of known inputs between observations, see `lfm_ppl.model.inputs.input_reads`."""
         functions = _integrated_functions(self.traced_functions()) if self._has_integrated_inputs else []
         # Inside of compiled code arithmetic on JAX arrays would give tracers.
-        tables = [[part if checks.traced(part) else np.asarray(part) for part in (rate.times, rate.values)]
-                  for _, rate in self.infusions]
-        of_infusions = [InputRead("previous", *table, 1.0, 0.0) for table in tables]
-        return input_reads(functions, first, last) + of_infusions
+        def concrete(part: Any) -> Any:
+            return part if checks.traced(part) else np.asarray(part)
+
+        return input_reads(functions, first, last) + [
+            InputRead("previous", concrete(rate.times), concrete(rate.values), 1.0, 0.0) for _, rate in self.infusions]
 
     @property
     def has_quadratic_inputs(self) -> bool:

@@ -242,8 +242,8 @@ def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[Regi
 
     def step(carry: tuple[RegimeMoments, RegimeMoments], inputs: tuple) -> tuple[tuple, tuple]:
         sources, merged = carry
-        transitions, is_start, intervals, row = inputs
-        entering = _enter_regimes(merged, *transitions, regimes.memory)
+        (transition, limit_transition), is_start, intervals, row = inputs
+        entering = _enter_regimes(merged, transition, limit_transition, regimes.memory)
         sources = jax.tree.map(lambda a, b: jnp.where(is_start, a, b), entering, sources)
         traces, distributions = [], []
         for j, (problem, update, interval) in enumerate(zip(regimes.problems, updates, intervals, strict=True)):
@@ -272,7 +272,7 @@ def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[Regi
         return (posterior, filtered), (output, recorded)
 
     transitions = regimes.transitions, regimes.limit_transitions
-    carry = _enter_regimes(initial, *(a[0] for a in transitions), regimes.memory), initial
+    carry = _enter_regimes(initial, transitions[0][0], transitions[1][0], regimes.memory), initial
     inputs = transitions, regimes.is_start, regimes.intervals, rows
     return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, inputs)[1]
 
