@@ -18,13 +18,20 @@ Source: Hochbruck and Ostermann (2010), Acta Numerica 19, section 2, for the wei
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.forces.discretise import discretise, discretise_dispersion, discretise_steps, phi_functions
+from lfm_ppl.forces.discretise import (
+    discretise,
+    discretise_dispersion,
+    discretise_steps,
+    phi_functions,
+    scalar_phi_functions,
+)
 from lfm_ppl.linearisation.rule import Function, partial_jacobian, selection
 from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -135,9 +142,14 @@ def feedback(ssm: StateSpaceModel, linear: LinearPart) -> jax.Array:
     return jnp.concatenate([linear.rows, below])
 
 
-def input_weights(jacobian: jax.Array, step: jax.Array) -> InputWeights:
-    """Return the weights of known inputs over a step, for the Jacobian J (M, M) of the physical state in itself."""
-    exponential, phi1, phi2, phi3 = phi_functions(jacobian * step)
+def input_weights(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array) -> InputWeights:
+    """Return the weights of known inputs over a step, for the constant Jacobian J of the physical state in itself."""
+    size = ssm.physical_dim
+    jacobian = step * linear.rows[:, :size]
+    if _pattern(ssm)[:, :size][~np.eye(size, dtype=bool)].any():
+        exponential, phi1, phi2, phi3 = phi_functions(jacobian)
+    else:
+        exponential, phi1, phi2, phi3 = jax.vmap(jnp.diag)(scalar_phi_functions(diagonal(jacobian)))
     # The Lagrange polynomials of the nodes 0, 1/2, 1, and int_0^1 exp(X (1 - s)) s^k ds = k! phi_(k+1)(X).
     return InputWeights(exponential, step * (phi1 - 3.0 * phi2 + 4.0 * phi3), step * (4.0 * phi2 - 8.0 * phi3),
                         step * (4.0 * phi3 - phi2))
@@ -197,8 +209,8 @@ def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPar
     process_cov = process_cov.at[..., size:total, size:total].set(force_cov) if size else process_cov
     inputs = None
     if not ssm.mean_invariant:
-        jacobian, step = linear.rows[:, :size], length / steps
-        inputs = (jax.vmap(input_weights, (None, 0)) if is_block else input_weights)(jacobian, step)
+        weights_of = functools.partial(input_weights, ssm, linear)
+        inputs = (jax.vmap(weights_of) if is_block else weights_of)(length / steps)
     return Exact(phi[..., :total, :total], process_cov[..., :total, :total], phi[..., :total, total], inputs)
 
 
@@ -244,7 +256,7 @@ def integrating_factor(ssm: StateSpaceModel, linear: LinearPart, step: jax.Array
     state_noise = None
     if dispersion is not None and not callable(dispersion):
         _, state_noise = discretise(jacobian, matmul(dispersion, dispersion.T), step)
-    return factor._replace(weights=input_weights(jacobian, step), state_noise=state_noise)
+    return factor._replace(weights=input_weights(ssm, linear, step), state_noise=state_noise)
 
 
 def _regressions(columns: tuple[jax.Array, ...], force_cov_half: jax.Array,
@@ -264,11 +276,16 @@ def _regressions(columns: tuple[jax.Array, ...], force_cov_half: jax.Array,
                  for end, width in zip(column_ends[side], widths[2 * side:2 * side + 2], strict=True))
 
 
+def _pattern(ssm: StateSpaceModel) -> np.ndarray:
+    """Return whether an output of the dynamics depends on a constant input, (M, M + R)."""
+    structure = ssm.drift_structure
+    pattern = np.array(structure.jacobian, bool).reshape(ssm.physical_dim, ssm.input_dim)
+    return pattern & np.isin(np.arange(ssm.input_dim), structure.constant)
+
+
 def _half_step(ssm: StateSpaceModel, linear: LinearPart, dt: jax.Array, forces: jax.Array) -> jax.Array:
     """Return E(dt) (n, n) from the transition of the forces."""
-    size = ssm.physical_dim
-    pattern = np.array(ssm.drift_structure.jacobian, bool).reshape(size, ssm.input_dim).copy()
-    pattern[:, [j for j in range(ssm.input_dim) if j not in ssm.drift_structure.constant]] = False
+    size, pattern = ssm.physical_dim, _pattern(ssm)
     coupled = pattern[:, size:].any() and ssm.constant_measurement
     state_pattern = pattern[:, :size]
     if coupled or state_pattern[~np.eye(size, dtype=bool)].any():

@@ -227,20 +227,24 @@ def repeat(function: Callable[..., tuple], values: tuple, count: jax.Array, most
         count: how often it is applied, a whole number; of many problems at once with the shape of the last axes.
         most: static bound on ``count``.
 
-    A block of applications that no problem needs is skipped, also under ``jax.vmap``.
+    Applications, and blocks of them, that no problem needs are skipped, also under ``jax.vmap``.
     """
 
-    def apply_once(values: tuple, index: jax.Array) -> tuple[tuple, None]:
-        is_active = index < count
-        return jax.tree.map(lambda new, old: jnp.where(is_active, new, old), function(*values), values), None
+    def unless_finished(body: Callable[[tuple, jax.Array], tuple]) -> Callable[[tuple, jax.Array], tuple[tuple, None]]:
+        def step(values: tuple, index: jax.Array) -> tuple[tuple, None]:
+            is_needed = eqxi.unvmap_any(index < count)
+            return jax.lax.cond(is_needed, lambda: body(values, index), lambda: values), None
 
-    def apply_block(values: tuple, first: jax.Array) -> tuple[tuple, None]:
-        indices = first + jnp.arange(_BLOCK)
-        is_needed = eqxi.unvmap_any(first < count)
-        return jax.lax.cond(is_needed, lambda: jax.lax.scan(apply_once, values, indices)[0], lambda: values), None
+        return step
+
+    def apply_once(values: tuple, index: jax.Array) -> tuple:
+        return jax.tree.map(lambda new, old: jnp.where(index < count, new, old), function(*values), values)
+
+    def apply_block(values: tuple, first: jax.Array) -> tuple:
+        return jax.lax.scan(unless_finished(apply_once), values, first + jnp.arange(_BLOCK))[0]
 
     starts = jnp.arange(0, most, _BLOCK)
-    return jax.lax.scan(jax.checkpoint(apply_block, prevent_cse=False), values, starts)[0]
+    return jax.lax.scan(jax.checkpoint(unless_finished(apply_block), prevent_cse=False), values, starts)[0]
 
 
 def phi_functions(matrix: jax.Array, max_doublings: int = MOST_DOUBLINGS) -> jax.Array:
@@ -278,6 +282,23 @@ def phi_functions(matrix: jax.Array, max_doublings: int = MOST_DOUBLINGS) -> jax
 
     (phi,) = repeat(double_once, (start,), doublings, max_doublings)
     return jnp.where(doublings <= max_doublings, phi, jnp.nan)
+
+
+def scalar_phi_functions(z: jax.Array) -> jax.Array:
+    """Return exp(z) and phi_1, phi_2, phi_3 of numbers z (...), see `phi_functions`: (4, ...).
+
+    Where z is small they are sums of a series, because the closed formulas cancel.
+    """
+    is_small = jnp.abs(z) < 1.0
+    small, large = jnp.where(is_small, z, 0.0), jnp.where(is_small, 1.0, z)
+    third = jnp.ones_like(z)
+    for order in range(20, 3, -1):
+        third = 1.0 + small * third / order
+    first_large = jnp.expm1(large) / large
+    second_large = (first_large - 1.0) / large
+    third = jnp.where(is_small, third / 6.0, (second_large - 0.5) / large)
+    second = jnp.where(is_small, 0.5 + small * third, second_large)
+    return jnp.stack([jnp.exp(z), jnp.where(is_small, 1.0 + small * second, first_large), second, third])
 
 
 def step_tangent(

@@ -10,7 +10,13 @@ import scipy.linalg
 from jax.test_util import check_grads
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lfm_ppl.forces.discretise import discretise, discretise_dispersion, discretise_steps, phi_functions
+from lfm_ppl.forces.discretise import (
+    discretise,
+    discretise_dispersion,
+    discretise_steps,
+    phi_functions,
+    scalar_phi_functions,
+)
 
 step = jax.jit(discretise, static_argnums=3)
 DTS = np.array([1e-6, 0.1, 1.0, 4.0])
@@ -183,4 +189,11 @@ def test_phi_functions_of_fast_decays():
     values = jax.jit(jax.vmap(phi_functions))(-rates[:, None, None])[:, :, 0, 0]
     expected = np.stack([0 * rates, 1 / rates, (1 - 1 / rates) / rates, (0.5 - (1 - 1 / rates) / rates) / rates], 1)
     assert_allclose(values, expected, rtol=1e-12)
+    numbers = jnp.array([-1e30, -50.0, -1.01, -0.99, -1e-3, 0.0, 1e-9, 0.9, 1.1, 20.0])
+    of_number = jax.vmap(lambda z: (scalar_phi_functions(z), jax.jacfwd(scalar_phi_functions)(z)))
+    values, slopes = jax.jit(of_number)(numbers)
+    matrices = numbers[:, None, None]
+    expected, expected_slopes = jax.jit(jax.vmap(lambda z: (phi_functions(z), jax.jacfwd(phi_functions)(z))))(matrices)
+    assert_allclose(values, expected[:, :, 0, 0], rtol=1e-13)
+    assert_allclose(slopes, expected_slopes[:, :, 0, 0, 0, 0], rtol=1e-11, atol=1e-30)
     check_grads(phi_functions, (jnp.array([[-3.0, 1.0], [0.2, -8.0]]),), order=1, modes=("fwd", "rev"), rtol=1e-6)
