@@ -32,13 +32,16 @@ from lfm_ppl.utils.linalg import congruence, matmul
 class SharedState(Force):
     """A force whose state has the entries of the state of another force of the same type and order.
 
-    Attributes:
+    Args:
         force: the force.
         reference: the force whose state gives the units of the derivatives.
     """
 
     force: Stretched
     reference: Stretched
+
+    def __init__(self, force: Stretched, reference: Stretched):
+        self.force, self.reference = force, reference
 
     @property  # type: ignore[misc]  # Equinox lets a property fill in an abstract field
     def mean(self) -> Any:
@@ -108,10 +111,9 @@ class SharedState(Force):
 
 def _unit_derivatives(force: Stretched) -> np.ndarray:
     """Return O (n, n), the rows h F_1^k."""
-    unit: Any = force.unit
     size = force.state_dim
-    first = unit.measurement if isinstance(force, SquaredExponential) else np.eye(size)[0]
-    return np.stack([first @ np.linalg.matrix_power(unit.feedback, k) for k in range(size)])
+    first = force.unit.measurement if isinstance(force, SquaredExponential) else np.eye(size)[0]
+    return np.stack([first @ np.linalg.matrix_power(force.unit.feedback, k) for k in range(size)])
 
 
 def in_state_of(force: Force, reference: Force) -> Force:

@@ -56,7 +56,8 @@ MERGINGS = {"imm": 0, "gpb2": 1, "gpb3": 2, "gpb4": 3}
 
 _VANISHING_RATE, _VANISHING_PROBABILITY = 1e-60, 1e-120
 """A rate and an initial probability in place of zero. With them a regime of probability zero has a state, the limit for
-rates that tend to zero, on which the derivative with respect to a rate of zero depends."""
+rates that tend to zero together, on which the derivative with respect to a rate of zero depends. That derivative is
+exact but for merging, which depends on the ratio of these rates where such a regime can be entered from several."""
 
 _LARGEST_EXPONENT, _LARGEST_LIMIT = 700.0, 1e200
 """Bounds of the density and the limit of a regime of probability zero, which overflow in data that contradict the
@@ -272,7 +273,7 @@ def _forward(regimes: RegimeProblem, y: jax.Array, record: Record) -> tuple[Regi
         return (posterior, filtered), (output, recorded)
 
     transitions = regimes.transitions, regimes.limit_transitions
-    carry = _enter_regimes(initial, transitions[0][0], transitions[1][0], regimes.memory), initial
+    carry = _enter_regimes(initial, regimes.transitions[0], regimes.limit_transitions[0], regimes.memory), initial
     inputs = transitions, regimes.is_start, regimes.intervals, rows
     return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, inputs)[1]
 

@@ -16,7 +16,7 @@ import lfm_ppl as lfm
 from lfm_ppl.filtering.forward import predict
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.switching.chain import MarkovChain, transition_matrices
-from lfm_ppl.switching.regimes import filter_regimes, sample_regimes
+from lfm_ppl.switching.regimes import filter_path, filter_regimes, sample_regimes
 
 MERGINGS = ("gpb2", "gpb3", "imm")
 RATES = np.array([[0.0, 0.3], [0.5, 0.0]])
@@ -42,6 +42,21 @@ def known_state(offset):
     return lfm.LatentForceModel(
         lambda x, u, t: -0.3 * x, {}, lfm.GaussianObservation(lambda x, u, t: x + offset, jnp.array([0.5])),
         lfm.Gaussian(jnp.ones(1), jnp.zeros((1, 1))))
+
+
+def heater(power):
+    """Return the temperature of a room that a heater warms, without process noise."""
+    return lfm.LatentForceModel(
+        lambda x, u, t: power - 0.2 * (x - 5.0), {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.09])),
+        lfm.Gaussian(jnp.array([8.0]), jnp.eye(1)))
+
+
+def heater_and_wall(power):
+    """Return the temperatures of a room, which is measured, and of its wall, without process noise."""
+    return lfm.LatentForceModel(
+        lambda x, u, t: jnp.stack([power - 0.2 * (x[0] - 5.0) + 0.5 * (x[1] - x[0]), 0.1 * (x[0] - x[1])]), {},
+        lfm.GaussianObservation(lambda x, u, t: x[:1], jnp.array([0.09])),
+        lfm.Gaussian(jnp.array([8.0, 8.0]), jnp.eye(2)))
 
 
 def enumerate_paths(switching, y):
@@ -87,6 +102,8 @@ def enumerate_paths(switching, y):
         mu = h @ np.concatenate(state_means) + np.concatenate([outputs[r][1] for r in path])
         s = h @ cross @ h.T + scipy.linalg.block_diag(*(outputs[r][2] for r in path))
         data = np.ravel(y)
+        present = np.isfinite(data)
+        data, mu, h, s = data[present], mu[present], h[present], s[np.ix_(present, present)]
         log_weights.append(log_weight + stats.multivariate_normal.logpdf(data, mu, s))
         means.append(np.concatenate(state_means) + cross @ h.T @ np.linalg.solve(s, data - mu))
     total = np.logaddexp.reduce(log_weights)
@@ -131,8 +148,9 @@ def test_draws_have_the_smoothing_distribution():
     switching = lfm.Switching({"calm": build(0.3), "rough": build(2.0, 0.3)}, RATES, np.arange(8.0))
     y = np.asarray(switching.sample(jax.random.key(1)))
     exact, regimes = enumerate_paths(switching, y), switching.regimes()
-    trace = filter_regimes(regimes, jnp.asarray(y))
-    paths, probability = jax.jit(lambda key: sample_regimes(key, regimes, trace, jnp.asarray(y), 4000))(jax.random.key(0))
+    data = jnp.asarray(y)
+    trace = filter_regimes(regimes, data)
+    paths, probability = jax.jit(lambda key: sample_regimes(key, regimes, trace, data, 4000))(jax.random.key(0))
     # Three standard errors of a probability are .024; merging adds less.
     np.testing.assert_allclose((paths == 1).mean(1), exact.probability[:, 1], atol=0.03)
     np.testing.assert_allclose(probability, exact.probability, atol=0.02)
@@ -142,6 +160,57 @@ def test_draws_have_the_smoothing_distribution():
     states = np.asarray(w[:, :, [0, 3]])
     np.testing.assert_allclose(states.mean(0), exact.mean, atol=0.05)
     np.testing.assert_allclose(states.var(0), np.diagonal(smoothed.covariance, axis1=1, axis2=2), rtol=0.15)
+
+
+HEATING = np.array([[0.0, 0.15], [0.25, 0.0]])
+NOISELESS = {"room": ({"off": heater(0.0), "on": heater(4.0)}, HEATING, 9),
+             "room and wall": ({"off": heater_and_wall(0.0), "on": heater_and_wall(4.0)}, HEATING, 9),
+             "three powers": ({"off": heater(0.0), "half": heater(2.0), "on": heater(4.0)},
+                              np.array([[0.0, 0.3, 0.1], [0.2, 0.0, 0.2], [0.1, 0.3, 0.0]]), 6)}
+
+
+@pytest.mark.parametrize("case", [pytest.param("room", marks=pytest.mark.slow), "room and wall", "three powers"])
+def test_regimes_without_process_noise_have_the_smoothing_distribution(case):
+    """A later state pins all earlier ones; rows are missing between."""
+    models, rates, rows = NOISELESS[case]
+    switching = lfm.Switching(models, rates, 0.5 * np.arange(rows), merging="gpb4")
+    y = np.array(jax.jit(switching.sample)(jax.random.key(3)))
+    y[[2, 3]] = np.nan
+    exact = enumerate_paths(switching, y)
+    smoothed = switching.smooth(y)
+    np.testing.assert_allclose(smoothed.probability, exact.probability, atol=0.04)
+    np.testing.assert_allclose(smoothed.mean, exact.mean, atol=0.06)
+
+
+@pytest.mark.parametrize(("merging", "rows", "present"), [
+    ("gpb2", 160, 1), *(pytest.param(*case, marks=pytest.mark.slow)
+                        for case in (("imm", 160, 1), ("gpb4", 160, 4), ("gpb2", 1000, 1)))])
+def test_long_records_without_process_noise_have_the_regimes_of_the_truth(merging, rows, present):
+    models, rates, _ = NOISELESS["room"]
+    switching = lfm.Switching(models, rates, 0.5 * np.arange(rows), merging=merging)
+    w, y = jax.jit(switching.simulate)(jax.random.key(1))
+    y = jnp.where((np.arange(rows) % present == 0)[:, None], y, jnp.nan)
+    draws, _ = jax.jit(jax.vmap(lambda key: switching.sample_path(key, y)))(jax.random.split(jax.random.key(0), 20))
+    is_right = np.asarray(draws[:, :, 2] == w[:, 2])
+    assert is_right.mean() > (0.99 if present == 1 else 0.9)
+    # A change that lies between two rows that are present moves the temperature by 1.8 degrees a row at most.
+    assert np.abs(draws[:, :, 0] - w[:, 0]).max() < (1.0 if present == 1 else 4.0)
+    assert np.sqrt(np.mean((draws[:, :, 0] - w[:, 0]) ** 2)) < (0.2 if present == 1 else 0.6)
+
+
+def test_nonlinear_regimes_without_process_noise_equal_the_filters_of_all_paths():
+    def model(sign):
+        return lfm.LatentForceModel(
+            lambda x, u, t: sign * x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
+            lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
+
+    switching = lfm.Switching({"well": model(1.0), "flat": model(-0.5)}, RATES, 0.5 * np.arange(6), merging="gpb4")
+    y, regimes = jax.jit(switching.sample)(jax.random.key(0)), switching.regimes()
+    paths = jnp.array(list(itertools.product(range(2), repeat=6)))
+    prior = jnp.log(regimes.transitions)[np.arange(1, 6), paths[:, :-1], paths[:, 1:]].sum(1)
+    filters = jax.jit(jax.vmap(lambda path: filter_path(regimes, y, path).log_likelihood.sum()))
+    weight = jax.nn.softmax(prior + filters(paths))
+    np.testing.assert_allclose(switching.smooth(y).probability[:, 1], weight @ paths, atol=0.05)
 
 
 @pytest.mark.parametrize("merging", MERGINGS)
@@ -232,6 +301,84 @@ def test_a_regime_that_cannot_be_reached_has_no_influence():
         return lfm.Switching({"a": build(), "b": build(5.0)}, rates, times, initial=[1.0, 0.0]).log_prob(y)
 
     assert np.isfinite(jax.grad(log_density)(0.0))
+
+
+ZERO_RATES = {
+    "a rate": lambda rate: (rate * np.array([[0, 1, 0], [0, 0, 0], [0, 0, 0]]), np.full(3, 1 / 3)),
+    "all rates, one start": lambda rate: (rate * np.array([[0, 1, 0.5], [0.3, 0, 0.2], [0.7, 0.1, 0]]),
+                                          np.array([1.0, 0.0, 0.0])),
+    "the only ways to a regime": lambda rate: (rate * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+                                              + np.array([[0, 0.4, 0], [0.3, 0, 0], [0.2, 0.5, 0]]),
+                                              np.array([0.6, 0.4, 0.0])),
+    "a probability": lambda p: (np.array([[0, 0.2, 0.1], [0.3, 0, 0], [0.7, 0.1, 0]]), jnp.stack([1 - p, 0.0 * p, p]))}
+
+
+@pytest.mark.parametrize(("case", "merging"), [
+    ("a rate", "gpb2"), ("the only ways to a regime", "gpb2"), ("a probability", "imm"),
+    *(pytest.param(*case, marks=pytest.mark.slow)
+      for case in (("all rates, one start", "gpb2"), ("the only ways to a regime", "gpb3"),
+                   ("the only ways to a regime", "imm")))])
+def test_the_gradient_at_a_rate_of_zero_is_the_one_sided_derivative(case, merging):
+    times, y = np.array([0.0, 0.4, 1.3, 1.5]), np.array([[0.1], [-0.4], [1.9], [2.2]])
+    models = {"low": build(0.5), "middle": build(0.5, level=1.0), "high": build(0.5, level=3.0)}
+
+    @jax.jit
+    def log_density(rate):
+        rates, initial = ZERO_RATES[case](rate)
+        return lfm.Switching(models, jnp.asarray(rates), times, merging=merging, initial=initial).log_prob(y)
+
+    step = 1e-7
+    quotient = (4 * log_density(step) - log_density(2 * step) - 3 * log_density(0.0)) / (2 * step)
+    np.testing.assert_allclose(jax.grad(log_density)(0.0), quotient, rtol=1e-5)
+    np.testing.assert_allclose(jax.jvp(log_density, (0.0,), (1.0,))[1], quotient, rtol=1e-5)
+
+
+def matern(scale, lengthscale):
+    """Return a state that follows a Matern force of order one."""
+    return lfm.LatentForceModel(
+        lambda x, u, t: u - x, {"u": lfm.Matern(scale, lengthscale, order=1)},
+        lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.05])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+
+
+def matern_as_states(scale, lengthscale):
+    """Return `matern` with u and u' as states of the dynamics."""
+    rate = np.sqrt(3.0) / lengthscale
+    return lfm.LatentForceModel(
+        lambda x, u, t: jnp.stack([x[1] - x[0], x[2], -(rate**2) * x[1] - 2 * rate * x[2]]), {},
+        lfm.GaussianObservation(lambda x, u, t: x[:1], jnp.array([0.05])),
+        lfm.Gaussian(jnp.zeros(3), jnp.diag(jnp.array([1.0, scale**2, (scale * rate) ** 2]))),
+        process_noise=np.array([[0.0], [0.0], [2 * scale * rate**1.5]]))
+
+
+@pytest.mark.parametrize("merging", ["gpb2", pytest.param("imm", marks=pytest.mark.slow)])
+def test_a_change_of_the_lengthscale_keeps_the_derivative_of_a_force(merging):
+    parameters = {"long": (1.0, 2.0), "short": (0.7, 0.4)}
+    times, y = np.array([0.0, 0.5, 1.0, 1.0, 2.5]), np.array([[0.1], [0.8], [np.nan], [1.4], [-1.0]])
+    forces, states = (lfm.Switching({name: make(*values) for name, values in parameters.items()}, RATES, times,
+                                    merging=merging) for make in (matern, matern_as_states))
+    np.testing.assert_allclose(forces.log_prob(y), states.log_prob(y), rtol=1e-10)
+    if merging == "gpb2":
+        smoothed, expected = forces.smooth(y), states.smooth(y)
+        np.testing.assert_allclose(smoothed.probability, expected.probability, atol=1e-8)
+        # The state of the forces is (x, u, u' / rate) with the rate of the first regime.
+        scale = np.array([1.0, 1.0, 2.0 / np.sqrt(3.0)])
+        np.testing.assert_allclose(smoothed.mean, expected.mean * scale, atol=1e-8)
+
+
+def test_stiff_regimes_take_exponential_steps():
+    def model(rate):
+        return lfm.LatentForceModel(
+            lambda x, u, t: -rate * (x - jnp.tanh(u)), {"u": lfm.Matern(1.0, 1.0, order=0)},
+            lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+
+    times, y = np.arange(4.0), np.array([[0.1], [0.4], [-0.3], [0.2]])
+    models = {"fast": model(300.0), "slow": model(1.0)}
+    explicit = lfm.Switching(models, np.zeros((2, 2)), times, initial=[1.0, 0.0])
+    exponential = explicit.with_settings(method="exponential")
+    single = lfm.MarginalLikelihood(models["fast"], times, iterations=0, method="exponential")
+    np.testing.assert_allclose(exponential.log_prob(y), single.log_prob(y), rtol=1e-9)
+    assert exponential.recorded_settings["method"] == "exponential"
+    assert np.isfinite(exponential.smooth(y, [0.5, 3.5]).mean).all()
 
 
 def test_impossible_data_have_a_density_of_minus_infinity():
@@ -363,6 +510,7 @@ def test_rates_are_calibrated():
     ({"models": {"a": build()}}, "at least two regimes"),
     ({"models": {"a": build(), "b": known_state(0.0)}}, "has forces"),
     ({"models": {"a": build(), "u": build()}}, "'u'"),
+    ({"method": "implicit"}, "method"),
 ])
 def test_malformed_arguments_have_one_line(change, match):
     arguments = {"models": {"a": build(), "b": build()}, "rates": RATES, "times": np.arange(3.0)} | change
