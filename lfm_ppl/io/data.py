@@ -42,7 +42,7 @@ def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column
 
     Raises:
         ValueError: the file is no comma-separated text, a column is missing, ambiguous or repeated, or a cell has no
-            number or no date, or a time goes back.
+            number or no date, a time goes back, or a column seems to identify several series.
 
     Warns:
         UserWarning: a number such as -9999 seems to stand for a missing value; a known input has empty cells.
@@ -165,8 +165,10 @@ def _read(table: Table, outputs: Sequence[str] | None, time_column: str | None,
         raise ValueError(f"{table.label}: expected at least one output column beside the time {time_name!r}, and each "
                          f"column once, as an output or an input; got the outputs {names} and the inputs "
                          f"{list(interpolations)}.")
-    free = set(columns) - {*interpolations, *(outputs or ())} if not part else set()
-    times, unit, origin = _times(table, time_name, time_unit, usual_unit, [name for name in columns if name in free])
+    used = {*interpolations, *(names if outputs is not None or len(names) == 1 else ())}
+    free = [] if part else [name for name in columns if name not in used]
+    times, unit, origin = _times(table, time_name, time_unit, usual_unit)
+    _check_order(table, time_name, times, free, outputs is not None)
     y = np.column_stack([table.numbers(name) for name in names])
     if observed and np.isnan(y).all():
         raise ValueError(f"{table.label}: every value of {', '.join(names)}{part} is missing; expected a number.")
@@ -199,12 +201,9 @@ def _unit_of(time_name: str) -> str | None:
     return calendar_time.UNITS.get(unit) if stem.lower() == "time" else None
 
 
-def _times(table: Table, name: str, unit: str | None, usual: str | None,
-           free: Sequence[str]) -> tuple[np.ndarray, str | None, str | None]:
-    """Return times (T,), their unit and their origin, None where the table does not say, see `read_csv`.
-
-    ``free`` are the columns that may hold identifiers of series.
-    """
+def _times(table: Table, name: str, unit: str | None,
+           usual: str | None) -> tuple[np.ndarray, str | None, str | None]:
+    """Return times (T,), their unit and their origin, None where the table does not say, see `read_csv`."""
     cells = table.frame[name].to_numpy()
     if (rows := np.flatnonzero([is_missing(cell) for cell in cells])).size:
         raise ValueError(f"{table.location(rows[0], name)}: the time is missing.")
@@ -218,19 +217,34 @@ def _times(table: Table, name: str, unit: str | None, usual: str | None,
             raise ValueError(f"{table.label}: the column {name!r} says that its unit is {named_unit}, and --time-unit "
                              f"(time_unit=) says {unit}.")
         unit = named_unit or unit
-    if (rows := np.flatnonzero(np.diff(times) < 0)).size:
-        row = rows[0] + 1
-        location = (f"{table.label}, row {table.frame.index[row]}: the time goes back from {cells[row - 1]} to "
-                    f"{cells[row]}")
-        if (series := _series_column(table, times, free)) is not None:
-            labels = table.frame[series].iloc[row - 1:row + 1]
-            change = " to ".join(map(str, labels))
-            raise ValueError(f"{location}, where the column {series!r} changes from {change}. If "
-                             f"it names several series, fit them separately: --series {series} (lfm.data.read_series("
-                             f"path, {series!r}), or lfm.read_table of each part of a DataFrame).")
-        raise ValueError(f"{location}. Sort the rows by time; replicates are rows with the same time. A clock that is "
-                         "set back for winter needs offsets from UTC.")
     return times, unit, origin
+
+
+def _check_order(table: Table, time_name: str, times: np.ndarray, free: Sequence[str], is_unused: bool) -> None:
+    """Raise ValueError where the time goes back, or where several series seem to stand in one table.
+
+    ``free`` are the columns that may hold identifiers of series; ``is_unused``: see `_merged_series_column`.
+    """
+    cells = table.frame[time_name].to_numpy()
+    rows = np.flatnonzero(np.diff(times) < 0)
+    series = _series_column(table, times, free) if rows.size else _merged_series_column(
+        table, times, free, is_unused)
+    if series is not None:
+        labels = table.frame[series].astype(str).to_numpy()
+        row = (rows if rows.size else np.flatnonzero(labels[1:] != labels[:-1]))[0] + 1
+        change = f"the column {series!r} changes from {labels[row - 1]} to {labels[row]}"
+        if rows.size:
+            change = f"the time goes back from {cells[row - 1]} to {cells[row]}, where {change}"
+        otherwise = "" if rows.size else (" If it names outputs, give each of them a column; else leave the column "
+                                          "out of the file or table.")
+        raise ValueError(f"{table.label}, row {table.frame.index[row]}: {change}. If "
+                         f"it names several series, fit them separately: --series {series} (lfm.data.read_series("
+                         f"path, {series!r}), or lfm.read_table of each part of a DataFrame).{otherwise}")
+    if rows.size:
+        row = rows[0] + 1
+        raise ValueError(f"{table.label}, row {table.frame.index[row]}: the time goes back from {cells[row - 1]} to "
+                         f"{cells[row]}. Sort the rows by time; replicates are rows with the same time. A clock that "
+                         "is set back for winter needs offsets from UTC.")
 
 
 def _input(table: Table, name: str, interpolation: str, times: np.ndarray) -> InputTable:
@@ -256,12 +270,30 @@ def _input(table: Table, name: str, interpolation: str, times: np.ndarray) -> In
     return InputTable(unique_times, first_values, "previous" if interpolation == "zero" else interpolation)
 
 
-_SERIES_NAMES = ("id", "subject", "patient", "series", "individual", "animal", "unit", "group", "name")
-"""Parts of the names of columns that often identify the series of a row."""
+_IDENTIFIERS = frozenset((
+    "id", "ids", "subject", "subj", "subjid", "subjectid", "usubjid", "patient", "patientid", "participant", "person",
+    "volunteer", "individual", "indiv", "animal", "animalid", "series", "group", "name", "who"))
+"""Words in the names of columns that identify the series of a row."""
+
+_SUBJECTS = _IDENTIFIERS | frozenset((
+    "mouse", "rat", "dog", "pig", "rabbit", "monkey", "sheep", "cow", "fish", "bird", "plant", "tree", "child",
+    "household", "customer", "cage", "plot", "tank", "well"))
+"""These, and words that also name measurements, such as the number of sheep."""
+
+_REPLICATES = frozenset(("replicate", "replicates", "replication", "rep", "reps", "repl", "repeat", "duplicate",
+                         "triplicate", "technical"))
+"""Words in the names of columns that number the measurements of one time."""
+
+
+def _words(name: str) -> set[str]:
+    """Return the words of a column's name, ``{"patient", "id"}`` for ``PatientID``; none of ``rat2``, a series."""
+    if re.search(r"\d", name):
+        return set()
+    return set(re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()))
 
 
 def _series_column(table: Table, times: np.ndarray, free: Sequence[str]) -> str | None:
-    """Return the column that seems to hold identifiers of series, None where there is none.
+    """Return the column that seems to hold identifiers of series where the time goes back, None where there is none.
 
     Its cells are filled, and the time does not go back among the rows that share a value. Unless its name is that of an
     identifier, these rows stand together, and a value has two of them or more on average.
@@ -272,11 +304,61 @@ def _series_column(table: Table, times: np.ndarray, free: Sequence[str]) -> str 
         order = np.argsort(index, kind="stable")
         goes_back = (np.diff(times[order]) < 0) & (np.diff(index[order]) == 0)
         # Replicates that stand one below the other are one series, to be sorted.
-        if name.lower() == "replicate" or len(labels) == 1 or goes_back.any() or any(
+        if _words(name) & _REPLICATES or len(labels) == 1 or goes_back.any() or any(
                 map(is_missing, table.frame[name])):
             continue
-        if any(part in _SERIES_NAMES for part in re.split(r"[^a-z]+", name.lower())):
+        if _words(name) & (_IDENTIFIERS | {"unit"}):
             return name
         if 1 + np.count_nonzero(np.diff(index)) == len(labels) <= len(index) / 2:
             candidates.append(name)
     return candidates[0] if candidates else None
+
+
+def _merged_series_column(table: Table, times: np.ndarray, free: Sequence[str], is_unused: bool) -> str | None:
+    """Return the column that seems to hold identifiers of series where the time never goes back.
+
+    Its cells are texts or whole numbers, all filled. Either its name is that of an identifier, and half of the rows or
+    more share their value with another row: a number of the row, or of an animal that is measured once, identifies no
+    series. Or its values tell rows of equal times apart, each of them at several times. A factor such as the weather
+    does not, as it is equal in rows of one time. Measurements that are whole numbers may tell rows apart, too, but not
+    with the same numbers at all times.
+
+    Args:
+        table: the table.
+        times: (T,).
+        free: the columns that may hold identifiers.
+        is_unused: whether these columns are known to be no outputs.
+    """
+    _, instant = np.unique(times, return_inverse=True)
+    for name in free:
+        words, cells = _words(name), table.frame[name]
+        kind = None if any(map(is_missing, cells)) or words & _REPLICATES else _kind_of_labels(cells)
+        if kind is None:
+            continue
+        labels, index, counts = np.unique(cells.astype(str), return_inverse=True, return_counts=True)
+        if len(labels) == 1:
+            continue
+        identifiers = _SUBJECTS if is_unused or kind is str else _IDENTIFIERS
+        if words & identifiers and counts[counts > 1].sum() >= len(index) / 2:
+            return name
+        rows = np.zeros((instant.max() + 1, len(labels)), int)
+        np.add.at(rows, (instant, index), 1)
+        is_shared = np.count_nonzero(rows, axis=1) > 1
+        if rows.max() == 1 and is_shared.sum() > 1 and counts.min() > 1 and (kind is str or rows.all()):
+            return name
+    return None
+
+
+def _kind_of_labels(cells: Any) -> type | None:
+    """Return str or int where all cells of a column are texts or whole numbers, else None."""
+    numbers = [_as_number(cell) for cell in cells]
+    if all(number is None for number in numbers):
+        return str
+    return int if all(number is not None and number == int(number) for number in numbers) else None
+
+
+def _as_number(cell: Any) -> float | None:
+    try:
+        return float(cell) if np.isfinite(float(cell)) else None
+    except (TypeError, ValueError):
+        return None
