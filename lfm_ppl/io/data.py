@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,8 @@ def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column
 
     Args:
         path: the file. Lines that start with ``#`` and blank lines are skipped.
-        outputs: the columns to read, in this order. None: every column but the time, the inputs and ``replicate``.
+        outputs: the columns to read, in this order. None: every column but the time, the inputs,
+            ``replicate`` and numbers of rows without a name (``Unnamed: 0``).
         time_column: the name of the time column. None: ``time``, ``t`` or ``time_UNIT``, as in ``time_h``, which also
             sets the unit of time; else ``date``, ``datetime``, ``timestamp``, or the only column that begins with a
             date.
@@ -32,7 +33,9 @@ def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column
             or "linear" (values are joined by lines), which interpolate over empty cells and warn of them; or "zero",
             which is "previous" with empty cells read as zero; or "dose:STATE", doses to a state in the rows with a
             number (see `lfm_ppl.Dose`). A row at the time of another row that has a value counts as filled.
-        time_unit: unit of times that are dates (ms, s, min, h, d, weeks, years). None: that of the time between rows.
+        time_unit: unit of the times (ms, s, min, h, d, weeks, years). Dates are counted in it, by default in that of
+            the time between rows. Numbers are in it; whole numbers that are all dates YYYYMMDD, YYYYMMDDHH or
+            YYYYMMDDHHMM are read as dates if it is given, or if the name of the column is that of a date.
         usual_unit: the default of ``time_unit``, the unit of a model.
         observed: whether a file without any value of the outputs is an error; known inputs of the future have none.
 
@@ -45,7 +48,8 @@ def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column
             number or no date, a time goes back, or a column seems to identify several series.
 
     Warns:
-        UserWarning: a number such as -9999 seems to stand for a missing value; a known input has empty cells.
+        UserWarning: a number such as -9999 seems to stand for a missing value; a known input has empty cells; numbers
+            seem to be dates; dates without offset from UTC seem to repeat or skip an hour of a change of the clock.
 
     Example:
         >>> import pathlib, tempfile
@@ -155,7 +159,7 @@ def _read(table: Table, outputs: Sequence[str] | None, time_column: str | None,
     time_name = _time_column(table, time_column)
     columns = [name for name in table.frame if name != time_name]
     names = list(outputs) if outputs is not None else [
-        name for name in columns if name and name not in interpolations and name.lower() != "replicate"]
+        name for name in columns if name not in interpolations and not _ROW_NAMES.fullmatch(name)]
     for kind, requested in (("output", names), ("input", interpolations)):
         for name in requested:
             if name not in columns:
@@ -167,6 +171,7 @@ def _read(table: Table, outputs: Sequence[str] | None, time_column: str | None,
                          f"{list(interpolations)}.")
     used = {*interpolations, *(names if outputs is not None or len(names) == 1 else ())}
     free = [] if part else [name for name in columns if name not in used]
+    _check_clock(table, time_name, {*interpolations, *(outputs or ())})
     times, unit, origin = _times(table, time_name, time_unit, usual_unit)
     _check_order(table, time_name, times, free, outputs is not None)
     y = np.column_stack([table.numbers(name) for name in names])
@@ -187,10 +192,13 @@ def _time_column(table: Table, time_column: str | None) -> str:
     candidates = ([name for name in header if name == time_column]
                   or [name for name in header if name.lower() == "time" or name == "t" or _unit_of(name)]
                   or [name for name in header if name.lower() in ("date", "datetime", "timestamp")]
-                  or [name for name in header if calendar_time.is_date(first_cells[name])])
+                  or [name for name in header if calendar_time.is_date(first_cells[name])]
+                  or [name for name in header if _names_dates(name)
+                      and calendar_time.compact_dates(table.frame[name]) is not None])
     if len(candidates) != 1:
         problem = f"several time columns: {', '.join(candidates)}" if candidates else (
-            f"no time column; expected `time`, `t`, `time_h`, or one of dates, got the columns {', '.join(header)}")
+            f"no time column; expected `time`, `t`, `time_h`, or one of dates, got the columns {', '.join(header)}"
+            + (", which are numbers: a first row of names may be missing" if all(map(_is_number, header)) else ""))
         raise ValueError(f"{table.label} has {problem}. Name it with --time-column (time_column=).")
     return candidates[0]
 
@@ -201,6 +209,11 @@ def _unit_of(time_name: str) -> str | None:
     return calendar_time.UNITS.get(unit) if stem.lower() == "time" else None
 
 
+def _names_dates(time_name: str) -> bool:
+    """Return whether the name of a column says that it holds dates."""
+    return bool(_words(time_name) & _DATES)
+
+
 def _times(table: Table, name: str, unit: str | None,
            usual: str | None) -> tuple[np.ndarray, str | None, str | None]:
     """Return times (T,), their unit and their origin, None where the table does not say, see `read_csv`."""
@@ -208,6 +221,11 @@ def _times(table: Table, name: str, unit: str | None,
     if (rows := np.flatnonzero([is_missing(cell) for cell in cells])).size:
         raise ValueError(f"{table.location(rows[0], name)}: the time is missing.")
     named_unit, origin = _unit_of(name), None
+    if (dates := calendar_time.compact_dates(cells)) is not None:
+        if unit or _names_dates(name):
+            cells = np.array(dates, object)
+        else:
+            calendar_time.warn_of_compact_dates(table.location(0, name), cells[0], dates[0])
     if calendar_time.is_date(cells[0]):
         times, origin, unit = calendar_time.numbers_of(name, cells, unit or named_unit or usual,
                                                        lambda row: table.location(row, name))
@@ -217,7 +235,45 @@ def _times(table: Table, name: str, unit: str | None,
             raise ValueError(f"{table.label}: the column {name!r} says that its unit is {named_unit}, and --time-unit "
                              f"(time_unit=) says {unit}.")
         unit = named_unit or unit
+        if unit is None and dates is None and _names_dates(name):
+            calendar_time.warn_of_serial_dates(table.location(0, name), times)
     return times, unit, origin
+
+
+def _check_clock(table: Table, time_name: str, used: Collection[str]) -> None:
+    """Raise ValueError where date and time of day stand in two columns.
+
+    The time of day is a text such as 06:30, or a number in a column of hours, where dates repeat or the hours go back.
+    It stands beside dates without it. ``used`` are the outputs and inputs, which hold no time.
+    """
+    def matches(pattern: re.Pattern, name: str) -> bool:
+        return all(pattern.fullmatch(str(cell).strip()) for cell in table.frame[name])
+
+    def holds_days(name: str) -> bool:
+        return matches(_DAY, name) or _names_dates(name) and matches(_COMPACT_DAY, name)
+
+    def holds_hours(name: str, has_evidence: Callable[[], bool]) -> bool:
+        if matches(_TIME_OF_DAY, name):
+            return True
+        numbers = map(_as_number, table.frame[name]) if _words(name) & _HOURS else [None]
+        return all(number is not None and 0 <= number <= 24 for number in numbers) and has_evidence()
+
+    def repeats_days() -> bool:
+        return table.frame[time_name].nunique() < len(table.frame)
+
+    def goes_back() -> bool:
+        return bool((np.diff(table.frame[time_name].astype(float)) < 0).any())
+
+    others = [name for name in table.frame if name != time_name and name not in used]
+    pair = None
+    if holds_hours(time_name, goes_back):
+        pair = next(((name, time_name) for name in others if holds_days(name)), None)
+    elif holds_days(time_name):
+        pair = next(((time_name, name) for name in others if holds_hours(name, repeats_days)), None)
+    if pair is not None:
+        date, hour = (table.frame[name].iloc[0] for name in pair)
+        raise ValueError(f"{table.label}: the date stands in the column {pair[0]!r} ({date}) and the time of day in "
+                         f"{pair[1]!r} ({hour}); write them in one column, such as 2026-03-31T18:00.")
 
 
 def _check_order(table: Table, time_name: str, times: np.ndarray, free: Sequence[str], is_unused: bool) -> None:
@@ -269,6 +325,19 @@ def _input(table: Table, name: str, interpolation: str, times: np.ndarray) -> In
         raise ValueError(f"{table.location(other_rows[0], name)}: the known input has another value at the same time.")
     return InputTable(unique_times, first_values, "previous" if interpolation == "zero" else interpolation)
 
+
+_DATES = frozenset(("date", "dates", "datetime", "timestamp", "yyyymmdd", "yyyymmddhh", "yyyymmddhhmm", "ymd", "datum"))
+"""Words in the names of columns of dates."""
+
+_ROW_NAMES = re.compile(r"|Unnamed: \d+(\.\d+)*|row\W?names|replicate", re.IGNORECASE)
+"""Names of columns that pandas, R and spreadsheets give to numbers of rows, and of replicates: no outputs."""
+
+_HOURS = frozenset(("time", "hour", "hours", "hh", "hr", "clock"))
+"""Words in the names of columns of times of day."""
+
+_DAY = re.compile(r"(\d{4}[-/.]\d\d?[-/.]\d\d?|\d\d?[-/.]\d\d?[-/.]\d{2,4})( 00:00:00)?")
+_COMPACT_DAY = re.compile(r"\d{8}")
+_TIME_OF_DAY = re.compile(r"\d\d?:\d\d(:\d\d(\.\d*)?)?( ?[AaPp][Mm])?")
 
 _IDENTIFIERS = frozenset((
     "id", "ids", "subject", "subj", "subjid", "subjectid", "usubjid", "patient", "patientid", "participant", "person",
@@ -332,8 +401,8 @@ def _merged_series_column(table: Table, times: np.ndarray, free: Sequence[str], 
     _, instant = np.unique(times, return_inverse=True)
     for name in free:
         words, cells = _words(name), table.frame[name]
-        kind = None if any(map(is_missing, cells)) or words & _REPLICATES else _kind_of_labels(cells)
-        if kind is None:
+        kind = None if words & _REPLICATES else _kind_of_labels(cells)
+        if kind is None or any(map(is_missing, cells)):
             continue
         labels, index, counts = np.unique(cells.astype(str), return_inverse=True, return_counts=True)
         if len(labels) == 1:
@@ -351,10 +420,14 @@ def _merged_series_column(table: Table, times: np.ndarray, free: Sequence[str], 
 
 def _kind_of_labels(cells: Any) -> type | None:
     """Return str or int where all cells of a column are texts or whole numbers, else None."""
-    numbers = [_as_number(cell) for cell in cells]
-    if all(number is None for number in numbers):
+    if all(_as_number(cell) is None for cell in cells):
         return str
+    numbers = map(_as_number, cells)
     return int if all(number is not None and number == int(number) for number in numbers) else None
+
+
+def _is_number(cell: Any) -> bool:
+    return _as_number(cell) is not None
 
 
 def _as_number(cell: Any) -> float | None:
