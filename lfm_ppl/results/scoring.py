@@ -19,7 +19,7 @@ import xarray as xr
 from scipy import stats
 from scipy.special import logsumexp
 
-from lfm_ppl.io.data_set import Data, at_origin
+from lfm_ppl.io.data_set import Data, at_origin, in_unit
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import clock_of
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable, quantiles
@@ -74,7 +74,7 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
         result: what `lfm_ppl.forecast`, or `lfm_ppl.fit` with ``at``, returned; or its dataset ``predictions``.
         held_out: (K, D) (or (K,) for one output; (B, K, D) for a panel), one row for each time of the predictions; or a
             `lfm_ppl.Data` or a DataArray with coordinates time and output, whose times must be among those predicted;
-            dates are counted as in the result. NaN entries are ignored.
+            dates, and numbers with a unit, are counted as in the result. NaN entries are ignored.
         level: of the interval, between 0 and 1.
         numpyro_model: of an observation family, the model that was fitted; without it there is no log score.
         inputs: as in `lfm_ppl.forecast`, and so is the next.
@@ -257,8 +257,12 @@ def aligned(predicted: xr.Dataset, variable: xr.DataArray, held_out: Any,
 
 def _on_clock(held_out: Any, origin: str | None, unit: str) -> Any:
     """Return held-out data whose dates are counted from the origin of the result, in its unit of time."""
-    if isinstance(held_out, Data) and held_out.origin is not None and origin is not None:
-        return at_origin(held_out, origin, unit)
+    if isinstance(held_out, Data) and unit and (held_out.origin is None) != (origin is None):
+        kinds = ("numbers", "dates") if origin is not None else ("dates", "numbers")
+        raise ValueError(f"the times of held_out are {kinds[0]}, and those of the result are {kinds[1]}; give "
+                         f"{kinds[1]}.")
+    if isinstance(held_out, Data):
+        return at_origin(held_out, origin, unit) if held_out.origin and origin else in_unit(held_out, unit)
     if isinstance(held_out, xr.DataArray) and "time" in held_out.coords:
         if calendar_time.holds_dates(dates := held_out["time"].values):
             times = calendar_time.positions("the times of held_out", dates, origin, unit)
