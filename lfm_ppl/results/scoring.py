@@ -24,6 +24,7 @@ from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import clock_of
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable, quantiles
 from lfm_ppl.utils import calendar_time, checks
+from lfm_ppl.utils.gaussian_residuals import TURN
 
 ALL = "all"
 """The row of a table of scores for all outputs together."""
@@ -120,11 +121,13 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
         full[..., columns] = y
         densities = _family_densities(result, numpyro_model, predicted, full, inputs, model_kwargs)[..., columns]
     angular = np.isin(names, json.loads(variable.attrs.get("angular") or "[]"))
-    return table(scores(flat_draws(variable), y, mean, sd, level, angular, densities), names, level)
+    period = float(variable.attrs.get("period", TURN))
+    return table(scores(flat_draws(variable), y, mean, sd, level, angular, densities, period), names, level)
 
 
 def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd: np.ndarray | None = None,
-           level: float = 0.95, angular: Any = False, densities: np.ndarray | None = None) -> Scores:
+           level: float = 0.95, angular: Any = False, densities: np.ndarray | None = None,
+           period: float = TURN) -> Scores:
     """Return the scores of single predictions.
 
     Args:
@@ -135,13 +138,15 @@ def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd:
         level: of the central interval.
         angular: (...), which are angles: differences are taken on the circle.
         densities: (S, ...), log densities of ``y`` at each draw, where these are not normal.
+        period: period of the angles.
     """
     if np.any(angular):
         # All angles on the branch centred on the mean direction.
-        centre = np.angle(np.exp(1j * draws).mean(axis=0))
+        scale = TURN / period
+        centre = np.angle(np.exp(1j * scale * draws).mean(axis=0)) / scale
 
         def unwrap(value: np.ndarray) -> np.ndarray:
-            return np.where(angular, centre + np.angle(np.exp(1j * (value - centre))), value)
+            return np.where(angular, centre + np.angle(np.exp(1j * scale * (value - centre))) / scale, value)
 
         draws, y, mean = unwrap(draws), unwrap(y), None if mean is None else unwrap(mean)
     present = np.isfinite(y)
