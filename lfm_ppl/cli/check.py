@@ -19,6 +19,7 @@ from typing import Any
 
 import lfm_ppl
 from lfm_ppl.cli import fit, page, results, session
+from lfm_ppl.cli.fit_arguments import TIME_UNIT
 from lfm_ppl.cli.options import CheckOptions
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.inference.posterior import evenly_spaced
@@ -41,7 +42,7 @@ _DRAWS, _DRAWS_TO_CORRECT = 200, 1000
 _CHAINS, _WARMUP, _SAMPLES = 4, 500, 500
 """Settings of the chains that correct a result of the sampler map, which has no chains."""
 
-_RECORD = ("model_file", "settings", "options", "data", "note", "time_origin", "description")
+_RECORD = ("model_file", "settings", "options", "data", "note", "time_origin", "description", TIME_UNIT)
 
 
 def run(result: str, options: CheckOptions, line: Sequence[str]) -> int:

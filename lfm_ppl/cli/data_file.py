@@ -7,7 +7,7 @@ import dataclasses
 from lfm_ppl.cli import choices
 from lfm_ppl.cli.options import Columns, DataOptions
 from lfm_ppl.io import data
-from lfm_ppl.io.data_set import Data
+from lfm_ppl.io.data_set import Data, in_unit
 from lfm_ppl.io.loading import ModelFile
 from lfm_ppl.utils import calendar_time, checks
 
@@ -49,15 +49,19 @@ def _time_unit(model: ModelFile) -> str | None:
 
 def _with_model_names(observed: Data, model: ModelFile, inputs: dict[str, tuple[str, str]], path: str,
                       options: DataOptions) -> Data:
-    """Return observations under the model's names of its outputs and inputs.
+    """Return observations under the model's names of its outputs and inputs, with times in its unit.
 
     Raises:
-        ValueError: the dates of the file cannot be converted to the model's unit of time.
+        ValueError: the times of the file cannot be converted to the model's unit of time.
     """
-    unit = model.units.get("time")
-    if observed.origin is not None and unit and _time_unit(model) is None and not options.time_unit:
-        raise ValueError(f"UNITS of {model.path} says that time is in {unit!r}, in which the dates of {path} cannot be "
-                         f"counted. Write one of {', '.join(calendar_time.USUAL)}, or give --time-unit.")
-    return dataclasses.replace(observed, outputs=model.outputs or observed.outputs,
-                               inputs={name: observed.inputs[column] for name, (column, _) in inputs.items()
-                                       if column in observed.inputs})
+    unit, unit_of_file = model.units.get("time"), observed.units.get("time")
+    if unit and _time_unit(model) is None and (observed.origin is not None and not options.time_unit or (
+            observed.origin is None and unit_of_file)):
+        kind, remedy = (("dates", ", or give --time-unit.") if observed.origin is not None
+                        else (f"times in {unit_of_file}", " there, or leave out the unit."))
+        raise ValueError(f"UNITS of {model.path} says that time is in {unit!r}, to which the {kind} of {path} cannot "
+                         f"be converted. Write one of {', '.join(calendar_time.USUAL)}{remedy}")
+    observed = dataclasses.replace(observed, outputs=model.outputs or observed.outputs,
+                                   inputs={name: observed.inputs[column] for name, (column, _) in inputs.items()
+                                           if column in observed.inputs})
+    return in_unit(observed, unit or "")

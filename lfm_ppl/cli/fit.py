@@ -21,7 +21,7 @@ import numpy as np
 import lfm_ppl
 from lfm_ppl.cli import choices, fit_many, page, results, session
 from lfm_ppl.cli.data_file import read_data, read_series
-from lfm_ppl.cli.fit_arguments import approximated_model, result_attributes, sampling_arguments
+from lfm_ppl.cli.fit_arguments import approximated_model, result_attributes, sampling_arguments, without_data
 from lfm_ppl.cli.options import DataOptions, FitArguments
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.inference.bind import bind
@@ -72,8 +72,8 @@ def run(name: str, options: FitArguments, line: Sequence[str]) -> int:
         start_time = time.perf_counter()
         with interruptible(lambda: _remains(folder, resume)):
             posterior = lfm_ppl.fit(
-                numpyro_model, observed, at=times, model_kwargs=keywords, fixed=fixed, progress=not output.quiet,
-                name=model.name, checkpoint=folder, resume=output.resume,
+                numpyro_model, observed, at=times, model_kwargs=without_data(keywords), fixed=fixed,
+                progress=not output.quiet, name=model.name, checkpoint=folder, resume=output.resume,
                 attributes=result_attributes(options, line, model, observed, model_options),
                 **sampling_arguments(options, model))
             partial = arviz_data.attributes(posterior).get("partial")
@@ -126,8 +126,8 @@ def _inputs_in_words(observed: Data) -> dict[str, str]:
 
 def _print_data(options: FitArguments, model: loading.ModelFile, observed: Data, fixed: dict[str, Any]) -> None:
     print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")
-    counts = dict(zip(observed.outputs, np.isnan(observed.y).reshape(-1, len(observed.outputs)).sum(axis=0),
-                      strict=True))
+    is_missing = np.isnan(observed.y) & ~_rows_of_doses(observed)[..., None]
+    counts = dict(zip(observed.outputs, is_missing.reshape(-1, len(observed.outputs)).sum(axis=0), strict=True))
     rows, missing = observed.y[..., 0].size, int(sum(counts.values()))
     text = f"{observed.times.shape[-1]} rows of {', '.join(observed.outputs)}"
     if observed.series:
@@ -138,16 +138,31 @@ def _print_data(options: FitArguments, model: loading.ModelFile, observed: Data,
         text += " (" + ", ".join(f"{'all' if count == rows else count} of {name}"
                                  for name, count in counts.items() if count) + ")"
     print(f"data     {options.data.data or 'simulated by the model'}: {text}")
-    for name in (name for name, count in counts.items() if count == rows):
+    for name in (name for name, values in zip(observed.outputs, np.moveaxis(observed.y, -1, 0), strict=True)
+                 if np.isnan(values).all()):
         print(f"note     {name} has no value: its own parameters follow the prior")
     if observed.inputs:
         print("inputs   " + ", ".join(f"{name} ({way})" for name, way in _inputs_in_words(observed).items()))
     if observed.origin is not None:
         print(f"time     in {observed.units['time']} since {observed.origin.replace('T', ' ')}")
+    elif options.data.time_unit and observed.units.get("time") != calendar_time.UNITS[options.data.time_unit]:
+        print(f"time     in {observed.units['time']}, the unit of the model, also for --until and --at; converted from "
+              f"{options.data.time_unit} in the file")
     anchors = model.anchors(observed)
     for name, value in fixed.items():
         is_anchor = name in anchors and anchors[name] == value
         print(f"fixed    {name} = {value}" + (f" by the model; --set {name}=free frees it" if is_anchor else ""))
+
+
+def _rows_of_doses(observed: Data) -> np.ndarray:
+    """Return which rows (T,), or (B, T), hold a dose and no measurement; their empty outputs are no missing values."""
+    is_dosed = np.zeros(observed.times.shape, bool)
+    for name, table in observed.inputs.items():
+        if table.dosed_state:
+            label = name.partition(OF_SERIES)[2]
+            series = observed.series.index(label) if label in observed.series else ...
+            is_dosed[series] |= np.isin(observed.times[series], table.times)
+    return is_dosed & np.isnan(observed.y).all(axis=-1)
 
 
 def _print_settings(options: FitArguments, model_options: dict[str, Any], observed: Data) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lfm_ppl.cli import choices, page
@@ -11,6 +11,9 @@ from lfm_ppl.cli.options import Approximation, FitArguments
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
+
+TIME_UNIT = "file_time_unit"
+"""Attribute of a result: the unit that --time-unit gave to the times of the data file."""
 
 _SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance", "method")
 
@@ -57,6 +60,14 @@ def sampling_arguments(options: FitArguments, model: loading.ModelFile) -> dict[
             "sampler_options": {name: value for name, value in sampler_options.items() if value is not None}}
 
 
+def without_data(keywords: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keyword arguments of a model without known inputs and doses.
+
+    `lfm_ppl.fit` takes them from the data, whose times it converts to the unit of the model.
+    """
+    return {name: value for name, value in keywords.items() if not (value and name in ("inputs", "events"))}
+
+
 def result_attributes(options: FitArguments, line: Sequence[str], model: loading.ModelFile, observed: Data,
                       model_options: dict[str, Any]) -> dict[str, Any]:
     """Return the attributes of a result that `lfm-ppl check` and `forecast` read."""
@@ -70,5 +81,6 @@ def result_attributes(options: FitArguments, line: Sequence[str], model: loading
         "meanings": json.dumps(dict(model.parameters)),
         "command_line": page.command_line(line),
         **({"note": observed.note} if observed.note else {}),
+        **({TIME_UNIT: options.data.time_unit} if options.data.time_unit else {}),
         **({"series_column": options.data.series} if observed.series and options.data.series else {}),
     }

@@ -20,7 +20,7 @@ from typing import Any
 import lfm_ppl
 from lfm_ppl.cli import choices, results, session
 from lfm_ppl.cli.data_file import read_data, read_series
-from lfm_ppl.cli.fit_arguments import approximated_model, result_attributes, sampling_arguments
+from lfm_ppl.cli.fit_arguments import approximated_model, result_attributes, sampling_arguments, without_data
 from lfm_ppl.cli.options import DataOptions, FitArguments
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.io import loading
@@ -53,7 +53,7 @@ def run(model_name: str, options: FitArguments, line: Sequence[str]) -> int:
         try:
             observed = model.prepare(file_data)
             arguments[name] = {
-                "model_kwargs": model.keywords(observed, model_options),
+                "model_kwargs": without_data(model.keywords(observed, model_options)),
                 "at": trajectory_times(observed, options.output.times),
                 "fixed": choices.fixed(options.inference.set, model.anchors(observed), model.options),
                 "name": model.name}

@@ -21,11 +21,12 @@ import pandas as pd
 import lfm_ppl
 from lfm_ppl.cli import choices, page, results, session
 from lfm_ppl.cli.data_file import output_columns
+from lfm_ppl.cli.fit_arguments import TIME_UNIT
 from lfm_ppl.cli.options import ForecastOptions, Times
 from lfm_ppl.cli.requested_times import requested_times
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
-from lfm_ppl.io.data_set import Data, at_origin
+from lfm_ppl.io.data_set import Data, at_origin, in_unit
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.results import arviz_data, files, html_report, inputs, plots, tables
 from lfm_ppl.results.plots.trajectories import trajectory_names
@@ -46,7 +47,7 @@ def run(result: str, options: ForecastOptions, line: Sequence[str]) -> int:
     """Write the forecast into the result, as a table and as a figure, with scores for held-out data."""
     if options.held_out is None and options.times == Times():
         raise ValueError("no times to forecast; give --until TIME, --at T1,T2,... or --held-out FILE.")
-    options.columns.refuse_without("--held-out", options.held_out)
+    options.columns.refuse_without("--held-out", options.held_out, time_unit=options.time_unit)
     path = files.locate(result)
     posterior = arviz_data.load(path)
     with contextlib.ExitStack() as stack:
@@ -104,16 +105,20 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
                              "out.")
     model = dataclasses.replace(task.file, outputs=observed.outputs, inputs=interpolations)
     columns = choices.inputs(options.columns, model) if interpolations else {}
+    unit = observed.units.get("time", "")
+    time_unit = options.time_unit or arviz_data.attributes(task.posterior).get(TIME_UNIT)
     read = data.read_csv(path, output_columns(options.columns, model), options.columns.time_column,
-                         dict(columns.values()), None if observed.origin is None else observed.units.get("time"),
+                         dict(columns.values()), time_unit or (unit if observed.origin is not None else None),
                          observed=not columns)
     if (read.origin is None) != (observed.origin is None):
         kinds = ("plain numbers", "dates") if read.origin is None else ("dates", "plain numbers")
         raise ValueError(f"{path}: its times are {kinds[0]}, the times of the result {kinds[1]}; use the same form.")
     read = dataclasses.replace(read, outputs=observed.outputs, inputs={
         name: read.inputs[column] for name, (column, _) in columns.items() if column in read.inputs})
-    if observed.origin is not None:
-        read = at_origin(read, observed.origin, observed.units["time"])
+    read = in_unit(read, unit) if observed.origin is None else at_origin(read, observed.origin, unit)
+    if observed.origin is None and read.units.get("time", unit) != unit:
+        raise ValueError(f"{path}: its times are in {read.units['time']}, and those of the result in "
+                         f"{unit or 'no known unit'}, to which they cannot be converted.")
     if repeated_rows := int(np.isin(read.times, observed.times).sum()):
         print(f"note     {repeated_rows} of {len(read.times)} rows of {path} are at times of the fitted data: if they "
               "are the same data, their scores are not scores of a forecast")

@@ -46,6 +46,13 @@ def _refuse_empty(hint: Any, value: Any) -> None:
         raise ValueError("The value is empty.")
 
 
+def _check_time_unit(unit: str | None) -> None:
+    if unit is not None:
+        from lfm_ppl.utils import calendar_time, checks
+
+        checks.one_of("unit of time", unit, calendar_time.SECONDS)
+
+
 def _integer(least: int) -> Callable:
     return _number(int, lambda value: value >= least, f"a whole number of at least {least}")
 
@@ -161,7 +168,8 @@ class DataOptions:
     """fit each series separately: the rows with the same value in this column; all together if the model is a panel"""
     columns: Annotated[Columns, Parameter(name="*")] = Columns()
     time_unit: Annotated[Text, Parameter(metavar="UNIT")] | None = None
-    """unit of times that are dates: ms, s, min, h, d, weeks, years (default: the model's, else by the gaps)"""
+    """unit of the times in the file: ms, s, min, h, d, weeks, years (default: the model's; of dates else by the gaps);
+    they are converted to the unit of the model, which --until, --at and the results have"""
     truth: File | None = None
     """true values for the figures and tables: the file that `simulate` wrote, or a JSON file with "times" and "forces",
     "state" or "parameters\""""
@@ -171,10 +179,7 @@ class DataOptions:
         if self.each and self.series is not None:
             raise ValueError("--each is for one series in each file, --series for several in one file; give one of "
                              "them.")
-        if self.time_unit is not None:
-            from lfm_ppl.utils import calendar_time, checks
-
-            checks.one_of("unit of time", self.time_unit, calendar_time.SECONDS)
+        _check_time_unit(self.time_unit)
 
 
 @_options_of("inference")
@@ -335,12 +340,18 @@ class ForecastOptions(Output):
     """CSV file of data that the fit did not use; they are predicted and scored; the outputs may all be empty where the
     file has known inputs"""
     columns: Annotated[Columns, Parameter(name="*")] = Columns()
+    time_unit: Annotated[Text, Parameter(metavar="UNIT")] | None = None
+    """unit of the times in that file (default: that of the fit)"""
     draws: Count = 400
     """number of posterior draws"""
     seed: CountOrZero = 0
     """random seed of paths and noise"""
     model: File | None = None
     """the model file, if it is not stored in the result"""
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown unit."""
+        _check_time_unit(self.time_unit)
 
 
 @_GENERAL

@@ -54,7 +54,8 @@ class AugmentedObservation(GaussianObservation):
 
     def __init__(self, inner: GaussianObservation, constraints: Constraints, data_rows: Any):
         self.function = StackedOutputs(inner.function, constraints)
-        self.covariance, self.angular, self.inner = inner.covariance, inner.angular, inner
+        self.covariance, self.angular, self.period = inner.covariance, inner.angular, inner.period
+        self.inner = inner
         self.variances, self.data_rows = jnp.ones((len(data_rows), constraints.count)), data_rows
 
     def covariance_at(self, x: jax.Array, u: jax.Array, t: jax.Array, row: jax.Array) -> jax.Array:

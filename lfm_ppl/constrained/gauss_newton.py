@@ -170,7 +170,7 @@ def _objective(problem: ConstrainedProblem, trajectory: Trajectory, process_cov:
     def misfit(state: jax.Array, t: jax.Array, y: jax.Array, chol: jax.Array) -> jax.Array:
         residual = jnp.where(jnp.isfinite(y), y, 0.0) - ssm.observe(ssm.inputs(state, t), t)[:outputs]
         for index in ssm.model.observation.angular:
-            residual = residual.at[index].set(wrapped(residual[index]))
+            residual = residual.at[index].set(wrapped(residual[index], ssm.model.observation.period))
         return (solve_lower(chol, jnp.where(jnp.isfinite(y), residual, 0.0)) ** 2).sum()
 
     data = jax.vmap(misfit)(*_states_at_data(problem, trajectory.nodes), problem.y, chol)

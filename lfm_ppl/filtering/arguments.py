@@ -11,7 +11,6 @@ import numpy as np
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.utils import checks
 
 
@@ -45,7 +44,7 @@ def check_observations(y: Any, count: int, outputs: int, empty: bool = False,
             raise ValueError(f"y[{row}, {column}] is infinite; use NaN for a missing entry.")
         if np.isnan(values).all() and not empty:
             raise ValueError("every entry of y is missing (NaN); there is nothing to learn from.")
-        if model is not None and isinstance(model.observation, ObservationFamily):
+        if model is not None:
             model.observation.check_data(values, names=model.output_names)
     return jnp.asarray(y, float)
 

@@ -24,7 +24,7 @@ from lfm_ppl.filtering.moments import Moments, matvec
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.model.state_space import StateSpaceModel
-from lfm_ppl.utils.gaussian_residuals import log_density, masked, wrapped
+from lfm_ppl.utils.gaussian_residuals import TURN, log_density, masked, wrapped
 from lfm_ppl.utils.linalg import (
     cholesky,
     congruence,
@@ -205,7 +205,7 @@ class SiteUpdate(NamedTuple):
 def linearize_observation(ssm: StateSpaceModel, rule: Rule, jacobian: jax.Array, t: jax.Array, row: jax.Array,
                           centre: Moments) -> LinearizedObservation:
     """Linearise the observation of a row at time t about given moments."""
-    angular = ssm.model.observation.angular
+    angular, period = ssm.model.observation.angular, ssm.model.observation.period
     if angular:
         middle = jax.lax.stop_gradient(ssm.observe(ssm.inputs(centre.mean, t), t))
 
@@ -213,7 +213,7 @@ def linearize_observation(ssm: StateSpaceModel, rule: Rule, jacobian: jax.Array,
         value = ssm.observe(w, t)
         for index in angular:
             # Averages are taken on the branch of the angle that is centred on the mean.
-            value = value.at[index].set(middle[index] + wrapped(value[index] - middle[index]))
+            value = value.at[index].set(middle[index] + wrapped(value[index] - middle[index], period))
         return value, ssm.obs_cov(w, t, row)
 
     affine = linearize(ssm, rule, function, ssm.observation_structure, jacobian, t,
@@ -247,7 +247,7 @@ def condition(ssm: StateSpaceModel, observation: LinearizedObservation, y: jax.A
     jacobian = jnp.where(present[:, None], observation.jacobian, 0.0)
     residual = jnp.where(present, y, 0.0) - observation.value
     for index in ssm.model.observation.angular:
-        residual = residual.at[index].set(wrapped(residual[index]))
+        residual = residual.at[index].set(wrapped(residual[index], ssm.model.observation.period))
     innovation, obs_cov = masked(residual, observation.obs_cov, present)
     cross = matmul(covariance, jacobian.T)
     innovation_covariance = matmul(jacobian, cross) + obs_cov
@@ -280,7 +280,7 @@ def _output_errors(ssm: StateSpaceModel, observation: LinearizedObservation, y: 
     change = matvec(observation.jacobian, filtered.mean - predicted.mean)
     error = y - (observation.value + change) - expected
     for index in ssm.model.observation.angular:
-        error = error.at[index].set(wrapped(error[index]))
+        error = error.at[index].set(wrapped(error[index], ssm.model.observation.period))
     return error, jnp.abs((matmul(observation.jacobian, filtered.covariance) * observation.jacobian).sum(1))
 
 
@@ -300,7 +300,7 @@ def _output_scale(problem: FilterProblem, y: jax.Array, initial: Moments) -> jax
     prior = safe_sqrt(diagonal(congruence(jacobian, initial.covariance)))
     scale = jnp.maximum(jnp.max(jnp.where(jnp.isfinite(y), jnp.abs(y), 0.0), axis=0), prior)
     for index in problem.ssm.model.observation.angular:
-        scale = scale.at[index].max(1.0)
+        scale = scale.at[index].max(problem.ssm.model.observation.period / TURN)
     return jax.lax.stop_gradient(scale)
 
 

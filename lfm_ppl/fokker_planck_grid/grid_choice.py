@@ -183,7 +183,7 @@ def _initial_cells(problems: Sequence[GridProblem], y: jax.Array, grid: Grid) ->
     for problem in problems:
         cells = problem.cells(grid)
         change = np.asarray(cells.value[..., -1, :] - cells.value[..., 0, :])
-        change = np.asarray(wrapped(jnp.asarray(change))) if np.any(cells.angular) else change
+        change = np.asarray(wrapped(jnp.asarray(change), cells.period)) if np.any(cells.angular) else change
         noise = np.broadcast_to(np.asarray(cells.noise)[:, :, 0], (*np.shape(cells.noise)[:2], *cells.noise.shape[-2:]))
         # Only cells that hold mass count.
         is_reached = problem.reach(y, grid) > 1e-6

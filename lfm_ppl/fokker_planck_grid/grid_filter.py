@@ -57,7 +57,7 @@ def _log_likelihood_of_cells(cells: Cells, index: jax.Array, y: jax.Array) -> ja
     value, noise = (a[jnp.where(a.shape[0] > 1, index, 0)] for a in (cells.value, cells.noise))
     present = jnp.isfinite(y)[:, None, None, :]
     residual = jnp.where(present, y[:, None, None, :], 0.0) - value
-    residual = jnp.where(cells.angular, wrapped(residual), residual)
+    residual = jnp.where(cells.angular, wrapped(residual, cells.period), residual)
     log = jnp.vectorize(_log_density, signature="(d),(d,d),(d)->()")(residual, noise, present)
     return jax.scipy.special.logsumexp(log + np.log(0.5 * WEIGHTS), axis=-1)
 

@@ -37,6 +37,7 @@ class Cells(eqx.Module):
             observations.
         noise: (T, N, G, D, D), noise covariance R at the nodes, with axes of length one where it does not vary.
         angular: (D,), whether a component of y is an angle.
+        period: period of the angles.
     """
 
     process: BirthDeathProcess
@@ -45,6 +46,7 @@ class Cells(eqx.Module):
     value: jax.Array
     noise: jax.Array
     angular: jax.Array
+    period: Any
 
 
 def varies_with_time(ssm: StateSpaceModel) -> bool:
@@ -76,7 +78,8 @@ def on_grid(ssm: StateSpaceModel, time_grid: TimeGrid, grid: Grid, padded_cells:
     value, noise = _observations(ssm, time_grid, grid, padded_cells)
     angular = np.isin(np.arange(ssm.output_dim), ssm.model.observation.angular)
     return Cells(_processes(ssm, time_grid, grid, padded_cells), jumps,
-                 gaussian_masses(grid, mean[0], covariance[0, 0]), value, noise, jnp.asarray(angular))
+                 gaussian_masses(grid, mean[0], covariance[0, 0]), value, noise, jnp.asarray(angular),
+                 jnp.asarray(ssm.model.observation.period, float))
 
 
 def drift_and_diffusion(ssm: StateSpaceModel, s: jax.Array, t: Any) -> tuple[jax.Array, jax.Array]:

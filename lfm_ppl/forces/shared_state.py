@@ -127,7 +127,7 @@ def in_state_of(force: Force, reference: Force) -> Force:
         reference: a force of the same structure, see `structure_of`.
     """
     if isinstance(force, Stretched) and isinstance(reference, Stretched):
-        return force if force.state_dim == 1 or _is_equal(force, reference) else SharedState(force, reference)  # type: ignore[call-arg]
+        return force if force.state_dim == 1 or _is_equal(force, reference) else SharedState(force, reference)
     if isinstance(force, Sum) and isinstance(reference, Sum):
         return Sum(tuple(in_state_of(*pair) for pair in zip(force.forces, reference.forces, strict=True)))
     if isinstance(force, QuasiPeriodic) and isinstance(reference, QuasiPeriodic):

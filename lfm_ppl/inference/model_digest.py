@@ -105,6 +105,7 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         self.settings += repr((
             site["name"], distribution.rule, distribution.steps, model.state_names, model.output_names,
             model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
+            *([model.observation.period] if model.observation.angular else []),
             model.deterministic_names, ssm.stack.jump_times,
             [event.observation_first for event in model.events]))
         if isinstance(distribution, ConstrainedLikelihood):

@@ -185,6 +185,7 @@ class Panel(dist.Distribution):
             for index, rows in enumerate(concrete):
                 model = self.series(index).model if self._has_series_times else self.first.model
                 if not isinstance(model.observation, ObservationFamily):
+                    model.observation.check_data(concrete.reshape(-1, concrete.shape[-1]), names=model.output_names)
                     break
                 try:
                     model.observation.check_data(rows, names=model.output_names)

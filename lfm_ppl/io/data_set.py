@@ -279,16 +279,25 @@ def keywords_by_site(sites: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[s
     return {name: {site: keywords.get(name, {}) for site, keywords in sites.items()} for name in names}
 
 
-def at_origin(data: Data, origin: str, unit: str) -> Data:
-    """Return data, whose times were dates, with their times counted from another origin, in another unit."""
+def at_origin(data: Data, origin: str | None, unit: str) -> Data:
+    """Return data with their times in another unit, and counted from another origin where they were dates."""
     ratio = calendar_time.SECONDS[data.units["time"]] / calendar_time.SECONDS[unit]
-    shift = float(calendar_time.positions("origin", data.origin, origin, unit))
+    shift = 0.0 if origin is None else float(calendar_time.positions("origin", data.origin, origin, unit))
     truth = data.truth
     if truth is not None and truth.get("times") is not None:
         truth = {**truth, "times": np.asarray(truth["times"], float) * ratio + shift}
     inputs = {name: table.on_clock(ratio, shift) for name, table in data.inputs.items()}
     return replace(data, times=data.times * ratio + shift, truth=truth, origin=origin, inputs=inputs,
                    units={**data.units, "time": unit})
+
+
+def in_unit(data: Data, unit: str) -> Data:
+    """Return data with their times in another unit; unchanged where one of the units is none of `calendar_time`."""
+    unit_of_data = data.units.get("time", "")
+    if {unit, unit_of_data} <= set(calendar_time.SECONDS) and (
+            calendar_time.UNITS[unit] != calendar_time.UNITS[unit_of_data]):
+        return at_origin(data, data.origin, unit)
+    return data
 
 
 def stack_series(series: Mapping[str, Data]) -> Data:
@@ -316,6 +325,7 @@ def stack_series(series: Mapping[str, Data]) -> Data:
                 first.outputs, list(first.inputs), first.origin is None):
             raise ValueError(f"series {name!r} must have the outputs and known inputs of series {label!r} "
                              f"({', '.join((*first.outputs, *first.inputs))}), and dates or numbers as times like it.")
+    calendar_time.check_offsets({name: data.origin for name, data in series.items()})
     if first.origin is not None:
         origin = min(str(data.origin) for data in series.values())
         series = {name: at_origin(data, origin, first.units["time"]) for name, data in series.items()}

@@ -45,7 +45,10 @@ class Table:
             row = int(np.argmax(np.isinf(values)))
             cell = self.frame[column].iloc[row]
             text = repr(cell) if len(repr(cell)) <= 60 else f"{repr(cell)[:50]}... ({len(repr(cell))} characters)"
-            raise ValueError(f"{self.location(row, column)}: {requirement.format(text)}{_remedy(str(cell))}")
+            remedy = _remedy(str(cell))
+            if row == 0 and not remedy and len(values) > 1 and np.isfinite(values[1:]).any():
+                remedy = " If it is a row of units, delete it, or begin it with #."
+            raise ValueError(f"{self.location(row, column)}: {requirement.format(text)}{remedy}")
         return values
 
 
@@ -65,8 +68,14 @@ def _number(cell: Any) -> float:
 
 
 def _remedy(cell: str) -> str:
+    if re.fullmatch(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?", cell):
+        return f" If commas mark thousands, leave them out, {cell.replace(',', '')}; a decimal comma is to be a point."
+    if re.fullmatch(r"[+-]?\d{1,3}(\.\d{3})+,\d+", cell):
+        return f" Write {cell.replace('.', '').replace(',', '.')}: thousands are not marked, and decimals have a point."
     if re.fullmatch(r"[+-]?\d+,\d+", cell):
         return f" A decimal point is a point, {cell.replace(',', '.')}; thousands are not marked."
+    if re.fullmatch(r"[+-]?[\d.]+([eE][+-]?\d+)?\s*[^\d\s.][^\d]*", cell):
+        return " Write the unit in the name of the column, and the number alone in the cell."
     if re.fullmatch(r"[<>]=?\s*[\d.]+", cell):
         return " Write a value beyond a limit as the limit; lfm.CensoredObservation(left=, right=) knows what it means."
     return ""
@@ -83,7 +92,14 @@ def read_file(path: str | Path) -> Table:
             numbered = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
             rows = {line: cells for line, cells in numbered if any(cells) and not cells[0].startswith("#")}
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is not a comma-separated text file (UTF-8): {error}.") from None
+        raise ValueError(f"{path} is not a comma-separated text file (UTF-8): {error}. Save it as CSV in UTF-8."
+                         ) from None
+    first_cells = next(iter(rows.values()), [])
+    if any("\0" in cell for cell in first_cells):
+        raise ValueError(f"{path} is not a comma-separated text file (UTF-8): it has zero bytes, as UTF-16 has. Save "
+                         "it as CSV in UTF-8.")
+    if first_cells and first_cells[0].lower() == "sep=" and not any(first_cells[1:]):  # written for a spreadsheet
+        del rows[next(iter(rows))]
     if len(rows) < 2:
         raise ValueError(f"{path} {'has a header and no rows' if rows else 'is empty'}; expected a header row and one "
                          "row per time.")
@@ -91,6 +107,10 @@ def read_file(path: str | Path) -> Table:
     if len(header) < 2 or header[0].startswith("<"):
         raise ValueError(f"{path}, row {first}: expected the names of columns, with commas between them, got "
                          f"{','.join(header)[:40]!r}. Export it as comma-separated CSV, with a point in decimals.")
+    # Empty columns at the right, which a spreadsheet leaves.
+    width = max(1 + max((k for k, cell in enumerate(cells) if cell), default=0) for cells in rows.values())
+    rows = {line: cells[:width] for line, cells in rows.items()}
+    header = header[:width]
     for line, cells in rows.items():
         if len(cells) != len(header):
             raise ValueError(f"{path}, row {line}: {len(cells)} cells, but the header has {len(header)} columns. Leave "

@@ -34,8 +34,8 @@ def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array
     if isinstance(family, ObservationFamily):
         return row_log_prob(family, row, ssm.observe(w, t), y).sum(), jnp.full(y.shape, jnp.nan)
     residual = jnp.where(present, y, 0.0) - ssm.observe(w, t)
-    for index in ssm.model.observation.angular:
-        residual = residual.at[index].set(wrapped(residual[index]))
+    for index in family.angular:
+        residual = residual.at[index].set(wrapped(residual[index], family.period))
     residual, noise = masked(residual, ssm.obs_cov(w, t, row), present)
     factor = cholesky(noise)
     white = solve_lower(factor.chol, residual)

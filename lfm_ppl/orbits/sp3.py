@@ -1,6 +1,7 @@
 """Orbits from SP3 files: the files of consecutive days, joined.
 
-1. Read the files (`sp3_file`), in the order of their first epochs.
+1. Read the files (`sp3_file`), in the order of their first epochs, without positions that are flagged as predictions
+   or manoeuvres.
 2. Check that interval, frame and time system agree, and that no span is missing.
 3. Join the positions; files that share an epoch must agree within a tolerance.
 """
@@ -9,13 +10,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
 from lfm_ppl.orbits.ephemerides import Ephemerides, calendar, check_satellites
-from lfm_ppl.orbits.sp3_file import Sp3File, read_file
+from lfm_ppl.orbits.sp3_file import FLAGS, Sp3File, read_file
 from lfm_ppl.utils import checks
 
 _NAME = re.compile(r".+\.sp3(\.gz|\.z)?", re.IGNORECASE)
@@ -25,6 +27,7 @@ def read_sp3(
     source: str | PathLike[str] | Iterable[str | PathLike[str]],
     satellites: Sequence[str] | None = None,
     tolerance: float = 1e-5,
+    include: Sequence[str] = (),
 ) -> Ephemerides:
     r"""Read the positions of satellites from SP3 files of consecutive days.
 
@@ -39,17 +42,23 @@ def read_sp3(
         satellites: the satellites to read, such as ``["G05"]``, in this order. None: all satellites, sorted.
         tolerance: how far apart, in kilometres, two files may put a satellite at an epoch that both have. Some agencies
             write the midnight between two days into both files; the position of the earlier file is kept.
+        include: flagged positions to read: "predicted" (flag P in column 80, as in the second half of an ultra-rapid
+            file), "manoeuvres" (flag M in column 79, at an epoch of a manoeuvre), or both.
 
     Returns:
-        The positions; NaN where a file has none: the satellite is not in it, has no line at an epoch, or has a position
-        of 0.000000 or 999999.999999, which stand for a missing one.
+        The positions; NaN where a file has none: the satellite is not in it, has no line at an epoch, has a flagged
+        position that ``include`` does not name, or a position of 0.000000 or 999999.999999, which stand for a missing
+        one.
 
     Raises:
         ValueError: with file and line, for a file that is cut, not SP3, or has text in a number column, for a file that
             does not begin where the one before ends, for files that disagree, or differ in interval, frame or time
             system; and for an unknown satellite, with the nearest names and the files.
         FileNotFoundError: if there is no such file or folder, or no SP3 file in the folder.
-        TypeError: if ``satellites`` is a single text.
+        TypeError: if ``satellites`` or ``include`` is a single text.
+
+    Warns:
+        UserWarning: flagged positions are left out; the message has their numbers.
 
     Example:
         >>> import pathlib, tempfile
@@ -75,12 +84,17 @@ def read_sp3(
     checks.positive("tolerance", tolerance, "It is a distance in kilometres.")
     if isinstance(satellites, str):
         check_satellites(satellites, ())
+    if isinstance(include, str):
+        raise TypeError(f"include must be a sequence of words, such as [{include!r}], got {include!r}.")
+    for name in include:
+        checks.one_of("include", name, FLAGS)
     files = [read_file(path, satellites) for path in _find(source)]
     files.sort(key=lambda file: (file.start, file.end))
     names = tuple(str(file.path) for file in files)
     available = sorted({name for file in files for name in file.header.satellites})
     selected = check_satellites(available if satellites is None else satellites, available, names)
     _check_alike(files)
+    files = _without_flagged(files, selected, include)
     positions = _connect(files, selected, tolerance)
     interval = files[0].header.interval
     return Ephemerides(
@@ -92,6 +106,27 @@ def read_sp3(
         agency=", ".join(dict.fromkeys(file.header.agency for file in files)),
         files=names,
     )
+
+
+def _without_flagged(files: list[Sp3File], satellites: tuple[str, ...], include: Sequence[str]) -> list[Sp3File]:
+    """Return files without flagged positions, unless ``include`` names the flag; warn of them."""
+    counts = dict.fromkeys([name for name in FLAGS if name not in include], 0)
+    cleaned, first = [], None
+    for file in files:
+        positions = file.positions.copy()
+        is_selected = np.isin(file.satellites, satellites)
+        for name in counts:
+            is_left_out = file.flags[name] & np.isfinite(file.positions).all(axis=-1)
+            positions[is_left_out] = np.nan
+            counts[name] += int(is_left_out[:, is_selected].sum())
+        first = first or (file.path if any(counts.values()) else None)
+        cleaned.append(replace(file, positions=positions))
+    if flagged := {name: count for name, count in counts.items() if count}:
+        words = {"predicted": "predicted (flag P)", "manoeuvres": "at epochs of a manoeuvre (flag M)"}
+        numbers = " and ".join(f"{count} {words[name]}" for name, count in flagged.items())
+        checks.warn(f"{first}: positions are left out, {numbers}. To read them: include={list(flagged)}, or --include "
+                    f"{' '.join(flagged)}.")
+    return cleaned
 
 
 def _find(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> list[Path]:

@@ -20,6 +20,7 @@ from lfm_ppl.orbits.ephemerides import DAY, calendar, gps_seconds
 # GPS time minus the time of the file, in seconds, where it never changes.
 TIME_SYSTEMS = {"GPS": 0.0, "GAL": 0.0, "QZS": 0.0, "IRN": 0.0, "TAI": -19.0, "BDT": 14.0}
 ABSENT = 999999.0  # km; and three zeros
+FLAGS = {"predicted": (80, "P"), "manoeuvres": (79, "M")}  # the column and the letter of a flagged position
 _SKIPPED = ("V", "EP", "EV")  # velocities, and correlations of positions and of velocities
 _MJD_OF_GPS_ORIGIN = 44244
 # Columns 5 to 46 are three numbers, F14.6; then to column 60 the clock, and to column 80 accuracies and flags. Strict,
@@ -65,6 +66,7 @@ class Sp3File:
         satellites: the satellites read, in the order of the header.
         positions: kilometres, shape (epochs, satellites, 3); NaN where there is none.
         lines: the line of each epoch.
+        flags: name in :data:`FLAGS` -> whether a position has the flag, shape (epochs, satellites).
     """
 
     path: Path
@@ -73,6 +75,7 @@ class Sp3File:
     satellites: tuple[str, ...]
     positions: np.ndarray
     lines: list[int]
+    flags: dict[str, np.ndarray]
 
     @property
     def end(self) -> float:
@@ -136,8 +139,8 @@ def read_file(path: Path, names: Container[str] | None = None) -> Sp3File:
     text = _Text(path, _read_lines(path))
     header = _read_header(text)
     satellites = tuple(name for name in header.satellites if names is None or name in names)
-    positions, lines = _read_positions(text, header, satellites)
-    return Sp3File(path, header, header.start + TIME_SYSTEMS[header.time_system], satellites, positions, lines)
+    positions, lines, flags = _read_positions(text, header, satellites)
+    return Sp3File(path, header, header.start + TIME_SYSTEMS[header.time_system], satellites, positions, lines, flags)
 
 
 def _read_lines(path: Path) -> list[str]:
@@ -226,8 +229,10 @@ def _name(cell: str) -> str:
     return cell[:1] + cell[1:].strip().zfill(2)
 
 
-def _read_positions(text: _Text, header: Header, satellites: tuple[str, ...]) -> tuple[np.ndarray, list[int]]:
-    """Return the positions (epochs, satellites, 3) and the lines of the epochs."""
+def _read_positions(
+    text: _Text, header: Header, satellites: tuple[str, ...]
+) -> tuple[np.ndarray, list[int], dict[str, np.ndarray]]:
+    """Return the positions (epochs, satellites, 3), the lines of the epochs, and the flags (epochs, satellites)."""
     columns = {name: satellites.index(name) if name in satellites else None for name in header.satellites}
     cells: list[int] = []
     values: list[tuple[float, float, float]] = []
@@ -255,7 +260,13 @@ def _read_positions(text: _Text, header: Header, satellites: tuple[str, ...]) ->
             break
         elif line and not line.startswith(_SKIPPED):
             raise text.error(number, f"expected a line that begins with *, P, V, EP, EV or EOF, got {line[:20]!r}.")
-    return _positions(text, (header.epochs, len(satellites)), cells, values, line_numbers), epochs
+    shape = (header.epochs, len(satellites))
+    flags = {name: np.zeros(shape, dtype=bool) for name in FLAGS}
+    for cell, number in zip(cells, line_numbers, strict=True):
+        line = text.lines[number - 1]
+        for name, (place, letter) in FLAGS.items():
+            flags[name].flat[cell] = line[place - 1 : place] == letter
+    return _positions(text, shape, cells, values, line_numbers), epochs, flags
 
 
 def _positions(

@@ -83,7 +83,8 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], draw_index: 
                       SD: variable("output", paths["predictive_sd"], "sd of the new observation at this draw"),
                       FREE_SD: variable("output", paths["output_sd"], f"sd of the {NOISE_FREE} at this draw")}
     angles = [named["output"][index] for index in model.observation.angular]
-    variables[site.name][2].update({"angular": json.dumps(angles)} if angles else {})
+    if angles:
+        variables[site.name][2].update({"angular": json.dumps(angles), "period": model.observation.period})
     words = {"output": NOISE_FREE, "state": "state", "force": "force", "deterministic": "of state and forces"}
     variables |= {f"{kind}s": variable(kind, paths[kind], word) for kind, word in words.items()
                   if paths[kind].shape[-1]}

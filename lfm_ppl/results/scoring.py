@@ -19,11 +19,12 @@ import xarray as xr
 from scipy import stats
 from scipy.special import logsumexp
 
-from lfm_ppl.io.data_set import Data, at_origin
+from lfm_ppl.io.data_set import Data, at_origin, in_unit
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import clock_of
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable, quantiles
 from lfm_ppl.utils import calendar_time, checks
+from lfm_ppl.utils.gaussian_residuals import TURN
 
 ALL = "all"
 """The row of a table of scores for all outputs together."""
@@ -74,7 +75,7 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
         result: what `lfm_ppl.forecast`, or `lfm_ppl.fit` with ``at``, returned; or its dataset ``predictions``.
         held_out: (K, D) (or (K,) for one output; (B, K, D) for a panel), one row for each time of the predictions; or a
             `lfm_ppl.Data` or a DataArray with coordinates time and output, whose times must be among those predicted;
-            dates are counted as in the result. NaN entries are ignored.
+            dates, and numbers with a unit, are counted as in the result. NaN entries are ignored.
         level: of the interval, between 0 and 1.
         numpyro_model: of an observation family, the model that was fitted; without it there is no log score.
         inputs: as in `lfm_ppl.forecast`, and so is the next.
@@ -120,11 +121,13 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
         full[..., columns] = y
         densities = _family_densities(result, numpyro_model, predicted, full, inputs, model_kwargs)[..., columns]
     angular = np.isin(names, json.loads(variable.attrs.get("angular") or "[]"))
-    return table(scores(flat_draws(variable), y, mean, sd, level, angular, densities), names, level)
+    period = float(variable.attrs.get("period", TURN))
+    return table(scores(flat_draws(variable), y, mean, sd, level, angular, densities, period), names, level)
 
 
 def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd: np.ndarray | None = None,
-           level: float = 0.95, angular: Any = False, densities: np.ndarray | None = None) -> Scores:
+           level: float = 0.95, angular: Any = False, densities: np.ndarray | None = None,
+           period: float = TURN) -> Scores:
     """Return the scores of single predictions.
 
     Args:
@@ -135,13 +138,15 @@ def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd:
         level: of the central interval.
         angular: (...), which are angles: differences are taken on the circle.
         densities: (S, ...), log densities of ``y`` at each draw, where these are not normal.
+        period: period of the angles.
     """
     if np.any(angular):
         # All angles on the branch centred on the mean direction.
-        centre = np.angle(np.exp(1j * draws).mean(axis=0))
+        scale = TURN / period
+        centre = np.angle(np.exp(1j * scale * draws).mean(axis=0)) / scale
 
         def unwrap(value: np.ndarray) -> np.ndarray:
-            return np.where(angular, centre + np.angle(np.exp(1j * (value - centre))), value)
+            return np.where(angular, centre + np.angle(np.exp(1j * scale * (value - centre))) / scale, value)
 
         draws, y, mean = unwrap(draws), unwrap(y), None if mean is None else unwrap(mean)
     present = np.isfinite(y)
@@ -257,8 +262,12 @@ def aligned(predicted: xr.Dataset, variable: xr.DataArray, held_out: Any,
 
 def _on_clock(held_out: Any, origin: str | None, unit: str) -> Any:
     """Return held-out data whose dates are counted from the origin of the result, in its unit of time."""
-    if isinstance(held_out, Data) and held_out.origin is not None and origin is not None:
-        return at_origin(held_out, origin, unit)
+    if isinstance(held_out, Data) and unit and (held_out.origin is None) != (origin is None):
+        kinds = ("numbers", "dates") if origin is not None else ("dates", "numbers")
+        raise ValueError(f"the times of held_out are {kinds[0]}, and those of the result are {kinds[1]}; give "
+                         f"{kinds[1]}.")
+    if isinstance(held_out, Data):
+        return at_origin(held_out, origin, unit) if held_out.origin and origin else in_unit(held_out, unit)
     if isinstance(held_out, xr.DataArray) and "time" in held_out.coords:
         if calendar_time.holds_dates(dates := held_out["time"].values):
             times = calendar_time.positions("the times of held_out", dates, origin, unit)

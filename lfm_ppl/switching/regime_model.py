@@ -87,7 +87,7 @@ def joint_model(models: Mapping[str, LatentForceModel], probabilities: jax.Array
         observation=GaussianObservation(
             select([model.observation.function for model in members]),
             select([functools.partial(model.observation.covariance_at, row=0) for model in members]),
-            first.observation.angular),
+            first.observation.angular, first.observation.period),
         initial_state=initial,
         process_noise=_joint_noise(members, size),
         initial_time=first.initial_time,

@@ -108,7 +108,8 @@ def check_structure(ssms: Mapping[str, StateSpaceModel]) -> None:
     structures = [{"states": ssm.model.state_names, "forces": ssm.model.force_names,
                    "types of forces": [structure_of(force) for force in ssm.model.force_list],
                    "outputs": ssm.model.output_names, "deterministics": ssm.model.deterministic_names,
-                   "angular outputs": ssm.model.observation.angular, "a joint state of size": ssm.state_dim,
+                   "angular outputs": ssm.model.observation.angular,
+                   "a period of angles": ssm.model.observation.period, "a joint state of size": ssm.state_dim,
                    "jump times": ssm.stack.jump_times} for ssm in ssms.values()]
     for name, structure in zip(names, structures, strict=True):
         for kind, value in structure.items():

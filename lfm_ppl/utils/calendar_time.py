@@ -6,7 +6,7 @@ Dates with an offset from UTC are subtracted in UTC, so that changes to and from
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from datetime import date, datetime, time, timedelta, timezone
 from typing import Any
@@ -21,6 +21,13 @@ UNITS = {spelling: unit for unit, (_, more) in _SPELLINGS.items() for spelling i
 SECONDS = {spelling: _SPELLINGS[unit][0] for spelling, unit in UNITS.items()}
 _SMALLEST_GAPS = {"years": 300 * 86400.0, "d": 86400.0, "h": 3600.0, "min": 60.0, "s": 0.0}  # in seconds
 _ISO_DATE = re.compile(r"\s*(?=.*[-:])\d{4}-?\d\d-?\d\d([\sT][\d:.]*)?\s*(?P<offset>Z|[+-]\d\d:?(\d\d)?)?\s*")
+_COMPACT_DATE = re.compile(r"(?P<year>(1[7-9]|2[01])\d\d)(?P<month>0[1-9]|1[0-2])(?P<day>0[1-9]|[12]\d|3[01])"
+                           r"((?P<hour>[01]\d|2[0-3]|24(?=$|00$))(?P<minute>[0-5]\d)?)?")
+_FIRST_SERIAL, _LAST_SERIAL = 20000.0, 73050.0
+"""Serial dates of 1954 and of 2099 in a spreadsheet."""
+
+_MONTHS_OF_CHANGES = (3, 4, 9, 10, 11)
+"""Months in which clocks change to or from summer time, on Sundays."""
 _CLOCK: ContextVar[tuple[str, str] | None] = ContextVar("clock", default=None)
 
 
@@ -31,6 +38,53 @@ def is_date(cell: Any) -> bool:
 
         return not pd.isna(pd.to_datetime(cell.strip(), format="ISO8601", errors="coerce"))
     return isinstance(cell, (date, np.datetime64)) or type(cell).__name__ == "Period"
+
+
+def compact_dates(cells: Any) -> list[datetime] | None:
+    """Return the dates in whole numbers or texts YYYYMMDD, YYYYMMDDHH or YYYYMMDDHHMM; None unless all cells are dates.
+
+    Hour 24 is hour 0 of the next day. The years are 1700 to 2199.
+    """
+    dates: list[datetime] = []
+    length = None
+    for cell in np.asarray(cells, object).flat:
+        match = _COMPACT_DATE.fullmatch(cell.strip() if isinstance(cell, str) else _digits(cell))
+        length = length or match and len(match[0])
+        if match is None or len(match[0]) != length:
+            return None
+        year, month, day, hour, minute = (
+            int(match[part] or 0) for part in ("year", "month", "day", "hour", "minute"))
+        try:
+            dates.append(datetime(year, month, day) + timedelta(hours=hour, minutes=minute))
+        except ValueError:  # no such day
+            return None
+    return dates or None
+
+
+def warn_of_compact_dates(label: str, number: Any, date: datetime) -> None:
+    """Warn of whole numbers that are all compact dates and are read as numbers."""
+    from lfm_ppl.utils import checks  # which imports this module
+
+    text = number if isinstance(number, str) else _digits(number)
+    checks.warn(f"{label}: {text} and all other times are dates YYYYMMDD, with or without HH or HHMM, and are read as "
+                "plain numbers. If they are dates, name the column `date` or give --time-unit d (time_unit='d'); in "
+                f"arrays, write np.datetime64('{date.isoformat(timespec='minutes')}').")
+
+
+def warn_of_serial_dates(label: str, times: np.ndarray) -> None:
+    """Warn of numbers that may be days since 1899-12-30, as spreadsheets count them."""
+    from lfm_ppl.utils import checks  # which imports this module
+
+    if _FIRST_SERIAL <= times.min() and times.max() <= _LAST_SERIAL:
+        date = datetime(1899, 12, 30) + timedelta(days=float(times[0]))
+        checks.warn(f"{label}: {times[0]:g} is read as a plain number. In a spreadsheet it is a date, "
+                    f"{date.isoformat(sep=' ', timespec='minutes')}: save the column in the form 2026-03-31 18:00; or "
+                    "give the unit of the numbers, --time-unit d (time_unit='d').")
+
+
+def _digits(cell: Any) -> str:
+    is_whole = isinstance(cell, (int, float, np.integer, np.floating)) and np.isfinite(cell) and cell == int(cell)
+    return str(int(cell)) if is_whole else ""
 
 
 def holds_dates(values: Any) -> bool:
@@ -91,8 +145,60 @@ def numbers_of(name: str, values: Any, unit: str | None = None,
     seconds = (dates - midnight).total_seconds().to_numpy()
     gaps = np.diff(seconds)
     gap = np.median(gaps[gaps > 0]) if (gaps > 0).any() else 0.0
+    if dates.tz is None and cells.ndim == 1:
+        _warn_of_changed_clock(location or (lambda row: f"{name}[{row}]"), dates, gap)
     unit = UNITS[unit] if unit else next(name for name, smallest in _SMALLEST_GAPS.items() if gap >= smallest)
     return (seconds / SECONDS[unit]).reshape(cells.shape), midnight.isoformat(), unit
+
+
+def _warn_of_changed_clock(location: Callable[[int], str], dates: Any, step: float) -> None:
+    """Warn of an hour that occurs twice, or not at all, as on a clock that changes to or from summer time.
+
+    The hour lies in the night of a Sunday, and the rows around it are ``step`` apart, in seconds, at most one hour.
+    """
+    from lfm_ppl.utils import checks  # which imports this module
+
+    instants, counts = np.unique(dates.to_numpy(), return_counts=True)
+    if not 0 < step <= 3600 or len(instants) < 3:
+        return
+    hours, gaps = instants.astype("M8[h]"), np.diff(instants) / np.timedelta64(1, "s")
+    repeated_hours = np.unique(hours[counts > 1])
+    is_rare = counts.max() == 2 and 2 * np.count_nonzero(counts == 2) < len(counts)
+    for hour in repeated_hours[:2] if is_rare else ():
+        if _may_change(hour) and (counts[hours == hour] == 2).all():
+            text = str(hour.astype("M8[m]"))
+            label = location(int(np.argmax(dates.to_numpy().astype("M8[h]") == hour)))
+            checks.warn(f"{label}: the hour from {text} occurs twice, and its rows are read as replicates. If the "
+                        "clock was set back there, they are an hour apart: give all times their offset, such as "
+                        f"{text}+02:00 and {text}+01:00.")
+            return
+    for index in np.flatnonzero(np.isclose(gaps, step + 3600)):
+        earlier, later = instants[index:index + 2].astype("M8[m]")
+        hour = (earlier + np.timedelta64(round(step), "s")).astype("M8[h]")
+        neighbours = np.append(gaps[max(index - 1, 0):index], gaps[index + 1:index + 2])
+        if _may_change(hour) and earlier < hour and np.allclose(neighbours, step):
+            label = location(int(np.argmax(dates.to_numpy() == instants[index + 1])))
+            checks.warn(f"{label}: the hour from {hour.astype('M8[m]')} is skipped, and {earlier} and {later} are read "
+                        f"as {gaps[index] / 60:g} min apart. If the clock was set forward there, they are "
+                        f"{step / 60:g} min apart: give all times their offset from UTC, such as {earlier}+01:00 and "
+                        f"{later}+02:00.")
+            return
+
+
+def _may_change(hour: np.datetime64) -> bool:
+    """Return whether clocks may change to or from summer time in an hour."""
+    stamp = hour.astype(datetime)
+    return stamp.weekday() == 6 and stamp.month in _MONTHS_OF_CHANGES and stamp.hour <= 3
+
+
+def check_offsets(origins: Mapping[str, str | None]) -> None:
+    """Raise ValueError where the clocks of some origins, by name, have an offset from UTC and others have none."""
+    has_offset = {name: datetime.fromisoformat(origin).tzinfo is not None for name, origin in origins.items() if origin}
+    if len(set(has_offset.values())) > 1:
+        with_offset, without = (next(name for name, value in has_offset.items() if value is wanted)
+                                for wanted in (True, False))
+        raise ValueError(f"the times of {with_offset!r} have an offset from UTC, and those of {without!r} have none; "
+                         "give an offset in all of them, or in none.")
 
 
 def positions(name: str, values: Any, origin: str | None, unit: str) -> Any:

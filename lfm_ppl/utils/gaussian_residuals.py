@@ -39,6 +39,11 @@ def log_density(white: jax.Array, chol: jax.Array, present: jax.Array | None = N
     return -0.5 * ((white**2).sum(-1) + count * _LOG_2PI) - scale
 
 
-def wrapped(angle: jax.Array) -> jax.Array:
-    """Return the angle reduced to [-pi, pi] radians."""
-    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
+TURN = 2.0 * float(np.pi)
+"""Period of an angle in radians."""
+
+
+def wrapped(angle: jax.Array, period: float = TURN) -> jax.Array:
+    """Return the angle reduced to [-period / 2, period / 2]."""
+    scale = TURN / period
+    return jnp.arctan2(jnp.sin(scale * angle), jnp.cos(scale * angle)) / scale

@@ -28,6 +28,9 @@ _SHORTEST_S = 1.0
 _PACE_S = 60.0
 """Seconds over which the pace is measured."""
 
+_LEAST_STEPS = 2
+"""Fewest steps, draws or tasks whose pace is extrapolated: the first one may compile."""
+
 
 class Console:
     """Standard error as the target of a `Progress`.
@@ -135,8 +138,8 @@ class Progress:
             self._report(line)
 
     def seconds_left(self) -> float | None:
-        """Return the seconds left; None before two records."""
-        if len(self._records) < 2 or self._records[-1][1] <= self._records[0][1]:
+        """Return the seconds left; None before the pace of `_LEAST_STEPS` is measured."""
+        if len(self._records) < 2 or self._records[-1][1] < self._records[0][1] + _LEAST_STEPS:
             return None
         (first_time, first_done), (last_time, last_done) = self._records[0], self._records[-1]
         return (last_time - first_time) / (last_done - first_done) * (self._total - last_done)
@@ -174,8 +177,8 @@ class TaskProgress(Progress):
         self.advance(self._done + 1, name)
 
     def seconds_left(self) -> float | None:
-        """Return the seconds left; None until as many tasks as workers have ended."""
-        if len(self._durations) < self._workers:
+        """Return the seconds left; None until as many tasks as workers have ended, and two."""
+        if len(self._durations) < max(self._workers, _LEAST_STEPS):
             return None
         return statistics.median_low(self._durations) * (self._total - self._records[-1][1]) / self._workers
 

@@ -29,6 +29,7 @@ from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_va
 from lfm_ppl.results.rebuilding import parameter_draws
 from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary, table
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.gaussian_residuals import TURN
 from lfm_ppl.utils.types import Times
 from lfm_ppl.workflows.data_binding import bind_dates
 from lfm_ppl.workflows.fit import fit
@@ -172,6 +173,7 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
     check_possible(bound, times)
     model = bound.site.example.ssm.model
     angular = np.isin(np.arange(y.shape[1]), model.observation.angular)
+    period = model.observation.period
     reference = "persistence" if season is None else "seasonal-naive"
     forecasts, naive, messages, programs = [], [], [], SharedPrograms()
     for origin in origins:
@@ -189,11 +191,11 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
             # An observation family has no normal distribution at each draw.
             mean, sd = (flat_draws(predicted[name]) if name in predicted else None for name in (MEAN, SD))
             densities = None if mean is not None else _of_family(bound, result, predicted, y[future])
-            origin_scores = scores(draws_of_y, y[future], mean, sd, level, angular, densities)
+            origin_scores = scores(draws_of_y, y[future], mean, sd, level, angular, densities, period)
         messages += [f"origin {times[origin]:g}: {warning.message}" for warning in caught]
         forecasts.append(((draws_of_y if mean is None else mean).mean(axis=0), origin_scores))
-        mean, sd = _naive(past[:origin + 1], horizon, season or 1, angular)
-        target = np.where(angular, mean + _wrapped(y[future] - mean), y[future])
+        mean, sd = _naive(past[:origin + 1], horizon, season or 1, angular, period)
+        target = np.where(angular, mean + _wrapped(y[future] - mean, period), y[future])
         naive.append((mean, gaussian_scores(mean, sd, target, level)))
         if progress:
             print(f"origin {times[origin]:g}: RMSE {summary(origin_scores, level)['rmse']:.4g}, {reference} "
@@ -223,7 +225,8 @@ def _origins(rows: int, horizon: int, stride: int, first: int | None) -> list[in
     return origins
 
 
-def _naive(y: np.ndarray, horizon: int, season: int, angular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _naive(y: np.ndarray, horizon: int, season: int, angular: np.ndarray,
+           period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and sd (H, D) of the reference given the rows (k + 1, D) so far; see `backtest`."""
     rows, outputs = y.shape
     mean, sd = np.full((2, horizon, outputs), np.nan)
@@ -236,16 +239,17 @@ def _naive(y: np.ndarray, horizon: int, season: int, angular: np.ndarray) -> tup
                 continue
             mean[lead - 1, output] = y[rows - 1 + lead - lag, output]
             change = y[lag:, output] - y[:-lag, output]
-            change = _wrapped(change) if angular[output] else change
+            change = _wrapped(change, period) if angular[output] else change
             change = change[np.isfinite(change)]
             if change.size > 1 and np.any(change):
                 sd[lead - 1, output] = np.sqrt(np.mean(change**2))
     return mean, sd
 
 
-def _wrapped(angle: np.ndarray) -> np.ndarray:
+def _wrapped(angle: np.ndarray, period: float) -> np.ndarray:
     """Return differences of angles on the circle; in NumPy, since each shape would be compiled otherwise."""
-    return np.angle(np.exp(1j * angle))
+    scale = TURN / period
+    return np.angle(np.exp(1j * scale * angle)) / scale
 
 
 def _dataset(forecasters: tuple, reference: str, times: np.ndarray, origins: list[int], horizon: int,

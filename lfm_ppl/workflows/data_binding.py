@@ -1,4 +1,4 @@
-"""Binding of a model to times that may be dates, counted in the unit of time that the model names."""
+"""Binding of a model to data whose times are dates or have a unit, counted in the unit of time that the model names."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
+import jax
 import numpy as np
 
 from lfm_ppl.filtering.time_grid import build_time_grid
@@ -13,8 +14,10 @@ from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.posterior import noise_of_rows
 from lfm_ppl.io.data import as_data
-from lfm_ppl.io.data_set import Data, at_origin, keywords_by_site, model_keywords
+from lfm_ppl.io.data_set import Data, at_origin, in_unit, keywords_by_site, model_keywords
 from lfm_ppl.io.table import is_table
+from lfm_ppl.model.events import Event
+from lfm_ppl.model.inputs import Input
 from lfm_ppl.utils import calendar_time, checks
 
 
@@ -30,13 +33,15 @@ def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
         model_kwargs: keyword arguments of the model, without the known inputs of ``data``.
 
     Returns:
-        The bound model; the data, with times in the unit of the model; the calendar time of t = 0 (None where times
-        are plain numbers) with the unit of time (empty where it is unknown).
+        The bound model; the data, with times in the unit of the model where both have one; the calendar time of t = 0
+        (None where times are plain numbers) with the unit of time (empty where it is unknown).
     """
     checks.refuse_durations("times", times)
     origin, unit = (None, "") if data is None else (data.origin, data.units.get("time", ""))
     if calendar_time.holds_dates(times):
         times, origin, unit = calendar_time.numbers_of("times", times)
+    elif data is None:
+        _warn_of_compact_dates("times", times)
     values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
 
     def bind_in(origin: str | None, unit: str) -> BoundModel:
@@ -48,11 +53,42 @@ def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
     # The model names its unit only once it has been built, which needs times.
     model_unit = bound.site.example.ssm.model.units.get("time", "")
     data_seconds, model_seconds = (calendar_time.SECONDS.get(name) for name in (unit, model_unit))
-    if origin is None or data_seconds is None or model_seconds is None or data_seconds == model_seconds:
+    if data_seconds is None or model_seconds is None or data_seconds == model_seconds:
         return bound, data, (origin, unit)
+    _check_unit_of_inputs(model_kwargs, data, unit, model_unit)
     times = np.asarray(times) * (data_seconds / model_seconds)
     data = None if data is None else at_origin(data, origin, model_unit)
     return bind_in(origin, model_unit), data, (origin, model_unit)
+
+
+def _warn_of_compact_dates(name: str, times: Any) -> None:
+    """Warn of an array of whole numbers that are all dates YYYYMMDD."""
+    if np.ndim(times) == 1 and not checks.traced(times) and np.asarray(times).dtype.kind in "iuf":
+        if (dates := calendar_time.compact_dates(times)) is not None:
+            calendar_time.warn_of_compact_dates(name, np.asarray(times)[0], dates[0])
+
+
+def _check_unit_of_inputs(model_kwargs: Mapping[str, Any] | None, data: Data | None, unit: str,
+                          model_unit: str) -> None:
+    """Raise ValueError where a known input or dose of the data, in their unit, is an argument of a model in another.
+
+    Warn of other ones where times are numbers: those of the data are converted, and nothing says what theirs count.
+    """
+    def is_event_or_input(value: Any) -> bool:
+        return isinstance(value, Input | Event)
+
+    leaves = jax.tree.leaves(dict(model_kwargs or {}), is_leaf=is_event_or_input)
+    members = [value for value in leaves if is_event_or_input(value)]
+    if data is None or not members:
+        return
+    for member in members:
+        if any(np.array_equal(member.times, table.times) for table in data.inputs.values()):
+            raise ValueError(f"model_kwargs hold a known input or doses of the data with times in {unit}, and the "
+                             f"model counts {model_unit}. Leave them out: those of the data are converted, and passed "
+                             "to the model.")
+    if data.origin is None:
+        checks.warn(f"the times of the data are converted from {unit} to {model_unit}, the unit of the model. The "
+                    f"times of known inputs and doses in model_kwargs are not, and are taken to be in {model_unit}.")
 
 
 def data_by_site(times: Any, y: Any) -> dict[str, Any] | None:
@@ -121,7 +157,8 @@ def bind_sites(numpyro_model: Callable, sites: Mapping[str, Any], model_kwargs: 
         if origins:
             raise ValueError("the times of some sites are dates and the others are numbers: give dates for all sites, "
                              "or numbers for all.")
-        return _bind_sites(numpyro_model, sites, model_kwargs), sites, (None, "")
+        return *_bind_numbers(numpyro_model, sites, model_kwargs), (None, "")
+    calendar_time.check_offsets({name: value.origin for name, value in sites.items()})
     unit = next(iter(sites.values())).units["time"]
     origin = origins[int(np.argmin([calendar_time.positions("times", date, origins[0], unit) for date in origins]))]
 
@@ -136,6 +173,24 @@ def bind_sites(numpyro_model: Callable, sites: Mapping[str, Any], model_kwargs: 
     units = [model.site.example.ssm.model.units.get("time") for model in bound.site_models.values()]
     model_unit = next((name for name in units if name in calendar_time.SECONDS), unit)
     return (bound, data, clock) if model_unit == unit else bind_in(model_unit)
+
+
+def _bind_numbers(numpyro_model: Callable, sites: Mapping[str, Any],
+                  model_kwargs: Mapping[str, Any] | None) -> tuple[BoundModel, dict[str, Any]]:
+    """Bind a model to sites whose times are numbers; those with a unit are converted to that of the model.
+
+    Where the model of a site names no unit, they are converted to that of the first site with one.
+    """
+    bound = _bind_sites(numpyro_model, sites, model_kwargs)
+    first = next((value.units["time"] for value in sites.values()
+                  if isinstance(value, Data) and value.units.get("time") in calendar_time.SECONDS), "")
+    units = {name: site_model.site.example.ssm.model.units.get("time", first)
+             for name, site_model in bound.site_models.items()}
+    converted = {name: in_unit(value, units[name]) if isinstance(value, Data) else value
+                 for name, value in sites.items()}
+    if all(converted[name] is value for name, value in sites.items()):
+        return bound, converted
+    return _bind_sites(numpyro_model, converted, model_kwargs), converted
 
 
 def _dated(times: Any, y: Any) -> Data | tuple[Any, Any]:

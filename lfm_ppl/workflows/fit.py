@@ -123,8 +123,10 @@ def fit(
             pandas or polars or an xarray Dataset (see `lfm.read_table`); the model then gets the known inputs as its
             argument ``inputs``. Dates (``datetime64``, a DatetimeIndex, ...) become numbers that count from the
             midnight before the first date, in the unit that the model names (``units={"time": "h"}``), else in the unit
-            of the time between rows. For several likelihood sites a dict of these by name, ``{"a": data, "b": (times,
-            y)}``: the model gets dicts of times, of y and of known inputs, and all dates count from one midnight.
+            of the time between rows. Numbers in `lfm.Data` with ``units={"time": "d"}`` are converted to that unit,
+            too, with the times of its known inputs; it is the unit of the result. For several likelihood sites a dict
+            of these by name, ``{"a": data, "b": (times, y)}``: the model gets dicts of times, of y and of known inputs,
+            and all dates count from one midnight.
         y: (T, D), NaN or masked where missing; (B, T, D) for a panel.
         sampler: "nuts", "ram" (robust adaptive Metropolis), "pmmh" (particle-marginal RAM: a particle filter estimates
             the likelihood, and the posterior is exact up to its integration steps), or "map" (posterior mode; the draws
@@ -316,8 +318,8 @@ def _site_problem(bound: BoundModel, site_data: Data | tuple, data: Any, clock: 
     """Check the arguments of `fit` on one likelihood site; ``data`` are ``site_data`` with times on the clock."""
     unit = site_data.units.get("time") if isinstance(site_data, Data) else None
     data = data if isinstance(data, Data) else None
-    if clock[0] is None and unit:  # numbers are not converted to a common unit
-        clock = None, unit
+    if clock[0] is None and data is not None:  # each site may have a unit of its own
+        clock = None, data.units.get("time", "")
     if calendar_time.holds_dates(at):
         at = calendar_time.positions("at", at, *clock)
     elif at is not None and unit is not None and unit != clock[1]:  # numbers in the unit of the user's data

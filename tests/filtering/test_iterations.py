@@ -79,7 +79,8 @@ def observe(well: Well, step: np.ndarray, generator: np.random.Generator) -> np.
 def random_wells(count: int) -> tuple[Well, np.ndarray, np.ndarray]:
     """Return wells (count,) whose paths start in either well, y (count, ROWS), and exact log likelihoods (count,).
 
-    The barrier, strength / 4, is at least as high as the noise's energy, dispersion^2 / 2: median errors below it are .2.
+    The barrier, strength / 4, is at least as high as the energy of the noise, dispersion^2 / 2: median errors below it
+    are .2.
     """
     generator, wells, data, exact = np.random.default_rng(3), [], [], []
     for index in range(count):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -72,6 +74,38 @@ def test_angles_are_compared_on_the_circle():
         turned = lfm.filter(angular, TIMES, Y + 2 * np.pi * turns)
         assert np.allclose(expected.log_likelihood, turned.log_likelihood, rtol=1e-10)
         assert np.allclose(expected.filtered_mean, turned.filtered_mean, atol=1e-12)
+
+
+@pytest.mark.parametrize("period", [360.0, 24.0])
+def test_angles_in_degrees_and_hours_are_compared_on_the_circle(period):
+    """A model of angles in another unit is the model in radians, up to the Jacobian of the unit."""
+    scale = period / (2 * np.pi)
+    prior = lfm.Gaussian(scale * PRIOR.mean, scale**2 * PRIOR.covariance)
+    radians, turned = (lfm.LatentForceModel(
+        ONE[0], {"u": lfm.Matern(unit * 1.0, 1.3, 1)}, lfm.GaussianObservation(first_state, unit**2 * jnp.array([0.1]),
+                                                                         angular=(0,), **options), start,
+        initial_time=0.0) for unit, options, start in ((1.0, {}, PRIOR), (scale, {"period": period}, prior)))
+    expected = lfm.filter(radians, TIMES, Y)
+    result = lfm.filter(turned, TIMES, scale * Y + period * np.arange(len(Y))[:, None])
+    assert np.allclose(result.log_likelihood, expected.log_likelihood - np.log(scale), rtol=1e-10)
+    assert np.allclose(result.filtered_mean, scale * expected.filtered_mean, atol=1e-9)
+
+
+def test_degrees_that_are_read_as_radians_are_named():
+    y = np.array([[10.0, 350.0], [np.nan, 355.0], [2.0, 5.0]])
+
+    def observed(angular, **options):
+        return lfm.GaussianObservation(lambda x, u, t: x[:2], jnp.ones(2), angular, **options)
+
+    with pytest.warns(UserWarning, match="'wind' reach 355.*period=360.*period=24"):
+        observed((1,)).check_data(y, names=("speed", "wind"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        observed(()).check_data(y)
+        observed((1,), period=360).check_data(y)
+        observed((0, 1)).check_data(np.radians(y / 10))
+    with pytest.raises(ValueError, match="period"):
+        observed((1,), period=0.0)
 
 
 def bearing(x, u, t):

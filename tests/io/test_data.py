@@ -175,6 +175,39 @@ def test_times_out_of_order_are_to_be_sorted(write, text):
         read_csv(write(text), outputs=["x"])
 
 
+@pytest.mark.parametrize("text", [
+    "ID,TIME,x\n1,0,9\n1,5,4\n2,6,9\n2,9,5\n", "ID,TIME,x\n1,0,9\n2,0,8\n1,5,4\n2,5,3\n",
+    "patient,time,x\nAnn,0,9\nBob,0,8\nAnn,5,4\nBob,5,3\n", "PatientID,time,x\n7,0,9\n7,1,8\n9,1,4\n",
+    "cage,time,x\nA,0,9\nB,0,8\nA,5,4\nB,5,3\nA,7,3\n", "rat,time,x\n1,0,9\n1,5,4\n2,6,9\n2,9,5\n",
+    "variant,time,x\n1,0,9\n2,0,8\n1,5,4\n2,5,3\n", "strain,time,x\nwt,0,9\nko,0,8\nwt,5,4\nko,5,3\n",
+], ids=lambda text: text[:20].replace("\n", " "))
+def test_series_whose_times_do_not_go_back_are_not_merged(write, text):
+    column = text.partition(",")[0]
+    with pytest.raises(ValueError, match=f"column '{column}' changes from .*--series {column} "):
+        read_csv(write(text), outputs=["x"])
+    assert len(read_series(write(text), column, outputs=["x"])) == 2
+
+
+@pytest.mark.parametrize("text", [
+    "time,weather,x\n0,dry,9\n1,dry,8\n2,wet,7\n3,wet,5\n4,dry,3\n",  # a factor
+    "time,weather,x\n0,dry,9\n0,dry,8\n2,wet,7\n2,wet,5\n",  # with replicates
+    "time,heater,x\n0,1,9\n1,1,8\n2,0,7\n3,0,5\n", "time,count,x\n0,3,9\n0,5,8\n2,5,7\n2,4,5\n",
+    "time,replicate,x\n0,1,9\n0,2,8\n1,1,3\n1,2,4\n", "time,tech_rep,x\n0,a,9\n0,b,8\n1,a,3\n1,b,4\n",
+    "time,id,x\n0,1,9\n1,2,8\n2,3,3\n", "time,animal,x\n0,1,9\n0,2,8\n2,3,3\n2,4,3\n",  # each measured once
+    "time,ID,x\n0,7,9\n1,7,8\n2,7,3\n", "time,dose,x\n0,1.5,9\n0,2.5,8\n1,1.5,3\n1,2.5,3\n",
+    "time,day,x\n0,1,9\n12,1,8\n24,2,7\n36,2,5\n", "time,rat1,rat2,x\n0,3,4,9\n1,3,5,9\n2,4,5,8\n",
+    "time,ID,x\n0,,9\n1,,8\n2,,3\n",
+], ids=lambda text: text[5:30].replace("\n", " "))
+def test_columns_that_do_not_identify_series_raise_no_alarm(write, text):
+    assert read_csv(write(text), outputs=["x"]).y[0, 0] == 9
+
+
+def test_outputs_with_names_of_subjects_are_measurements(write):
+    assert read_csv(write("time,sheep,wolves\n0,3,1\n1,3,1\n2,4,2\n3,4,2\n")).outputs == ("sheep", "wolves")
+    assert read_csv(write("time,series\n0,3\n1,3\n2,4\n3,4\n")).outputs == ("series",)
+    assert read_csv(write("time,ID,x\n0,1,9\n1,2,8\n2,1,3\n"), inputs=["ID"]).outputs == ("x",)
+
+
 def test_series_are_stacked_with_rows_all_missing_and_one_origin(write):
     path = write("date,x,who\n2026-01-05 06:00,1,b\n2026-01-04 12:00,2,a\n2026-01-05 18:00,3,b\n")
     panel = stack_series(read_series(path, "who", time_unit="h"))

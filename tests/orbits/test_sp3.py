@@ -157,6 +157,49 @@ def test_days_connect_in_any_order_and_satellites_come_and_go(write, tmp_path):
     assert chosen.satellites == orbits.select(["G32", "G06"]).satellites == ("G32", "G06")
 
 
+def flagged(lines, flags):
+    """Lines with flags at their ends: (beginning, occurrence) -> columns 61 to 80."""
+    for (text, occurrence), columns in flags.items():
+        number = line_of(lines, text, occurrence) - 1
+        lines[number] = lines[number].ljust(60) + columns
+    return lines
+
+
+PREDICTED, MANOEUVRE, CLOCK = " " * 15 + "P   P", " " * 18 + "M", " " * 14 + "EP"
+"""An orbit and its clock are predicted; a manoeuvre; only the clock is predicted, after an event."""
+
+
+def test_predicted_positions_and_manoeuvres_are_left_out_unless_they_are_named(write, recwarn):
+    path = write(flagged(sp3(), {("PG05", 1): MANOEUVRE, ("PG05", 2): PREDICTED, ("PG05", 3): PREDICTED,
+                                 ("PG32", 1): PREDICTED[:-1] + "  ", ("PE01", 3): CLOCK}))
+    whole = circle(START + STEP * np.arange(4), ["E01", "G05", "G32"])
+    for include, rows in (([], [1, 2, 3]), (["predicted"], [1]), (["manoeuvres"], [2, 3]),
+                          (["manoeuvres", "predicted"], [])):
+        expected = whole.copy()
+        expected[rows, 1] = np.nan
+        np.testing.assert_array_equal(read_sp3(path, include=include).positions, expected)
+    messages = [str(warning.message) for warning in recwarn]
+    assert len(messages) == 3 and "2 predicted (flag P) and 1 at epochs of a manoeuvre (flag M)" in messages[0]
+    assert "a.sp3" in messages[0] and "include=['predicted', 'manoeuvres']" in messages[0]
+    assert read_sp3(path, ["E01"]).gaps("E01") == [] and len(recwarn) == 3  # of another satellite
+    with pytest.raises(ValueError, match="'prediction'.*'predicted'"):
+        read_sp3(path, include=["prediction"])
+    with pytest.raises(TypeError, match="'predicted'"):
+        read_sp3(path, include="predicted")
+
+
+def test_a_prediction_is_replaced_by_the_position_of_a_later_file(write):
+    first = flagged(sp3(epochs=5), {("PG05", 4): PREDICTED})
+    wrong = line_of(first, "PG05", 4) - 1
+    first[wrong] = first[wrong].replace(first[wrong][4:18], f"{20000:14.6f}")
+    files = [write(first, "a.sp3"), write(sp3(1), "b.sp3")]
+    with pytest.warns(UserWarning, match="1 predicted"):
+        orbits = read_sp3(files)
+    np.testing.assert_array_equal(orbits.positions, circle(orbits.epochs, orbits.satellites))
+    with pytest.raises(ValueError, match="G05"):
+        read_sp3(files, include=["predicted"])
+
+
 def test_a_midnight_in_both_files_is_kept_once(write):
     second = circle(START + 86400 + STEP * np.arange(4))
     second[0, 0, 0] += 9e-6  # 9 mm

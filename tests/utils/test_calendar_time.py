@@ -12,9 +12,10 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.io.data import read_csv
-from lfm_ppl.io.data_set import Data
+from lfm_ppl.io.data_set import Data, stack_series
 from lfm_ppl.results.plots import style
 from lfm_ppl.utils import calendar_time
+from lfm_ppl.workflows.data_binding import bind_dates, bind_sites
 
 
 @pytest.mark.parametrize(("gap", "unit"), [
@@ -185,13 +186,75 @@ def test_dates_as_times_are_fitted_as_a_table_of_dates():
 def test_dates_are_counted_in_the_unit_that_the_model_names():
     hours, y = pd.date_range("2026-01-05 06:00", periods=8, freq="h"), np.sin(np.arange(8.0) / 5)[:, None]
     plain = lfm.fit(model, np.arange(6.0, 14.0) / 24, y, **OPTIONS)
-    in_hours = Data(hours, y, ("x",), {"time": "h"})
-    for data, at in (((hours, y), [13 / 24]), ((pd.DataFrame(y, hours, ["x"]),), hours[-1:]), ((in_hours,), [13.0])):
+    in_hours, numbers = Data(hours, y, ("x",), {"time": "h"}), Data(np.arange(6.0, 14.0), y, ("x",), {"time": "h"})
+    for data, at in (((hours, y), [13 / 24]), ((pd.DataFrame(y, hours, ["x"]),), hours[-1:]), ((in_hours,), [13.0]),
+                     ((numbers,), [13.0])):
         result = lfm.fit(model, *data, at=at, model_kwargs={"unit": "d"}, **OPTIONS)
         np.testing.assert_allclose(result["observed_data"]["time"], np.arange(6.0, 14.0) / 24, rtol=1e-15)
         np.testing.assert_allclose(result["posterior"]["rate"], plain["posterior"]["rate"], rtol=1e-8)
         assert result["trajectories"]["at"].attrs["units"] == "d"
         np.testing.assert_allclose(result["trajectories"]["at"], [13 / 24], rtol=1e-15)
+
+
+def test_held_out_numbers_are_in_the_unit_of_the_result():
+    y = np.sin(np.arange(8.0) / 5)[:, None]
+    result = lfm.fit(model, Data(np.arange(6.0, 14.0), y, ("x",), {"time": "h"}), **OPTIONS)
+    ahead = lfm.forecast(result, model, [15.0, 16.0], draws=5, progress=False)
+    expected = lfm.score(ahead, [[0.5], [0.6]])
+    held_out = Data([900.0, 960.0], [[0.5], [0.6]], ("x",), {"time": "min"})
+    pd.testing.assert_frame_equal(lfm.score(ahead, held_out), expected)
+    with pytest.raises(ValueError, match="held_out are dates"):
+        lfm.score(ahead, Data(pd.date_range("2026-01-05", periods=2), [[0.5], [0.6]], ("x",)))
+
+
+def test_known_inputs_have_the_unit_of_the_model_or_are_refused():
+    data = Data([0.0, 1.0], np.zeros((2, 1)), ("x",), {"time": "d"}, inputs={"heat": ([0.0, 0.5], [1.0, 2.0])})
+
+    def heated(times, y=None, inputs=None):
+        numpyro.sample("rate", dist.LogNormal(-1.0, 0.5))
+        numpyro.sample("y", lfm.MarginalLikelihood(system(units={"time": "hours"}), times), obs=y)
+
+    bound, converted, clock = bind_dates(heated, data.times, data.y, data, None)
+    assert bound.times.tolist() == [0.0, 24.0] and clock == (None, "hours")
+    assert converted.inputs["heat"].times.tolist() == [0.0, 12.0] and converted.units["time"] == "h"
+    with pytest.raises(ValueError, match="times in d, and the model counts hours"):
+        bind_dates(heated, data.times, data.y, data, {"inputs": data.known_inputs()})
+    with pytest.warns(UserWarning, match="converted from d to hours"):
+        bind_dates(heated, data.times, data.y, data, {"inputs": {"heat": lfm.Input([0.0, 30.0], [1.0, 2.0])}})
+
+
+def two_sites(times, y=None):
+    rate = numpyro.sample("rate", dist.LogNormal(-1.0, 0.5))
+    for name in ("a", "b"):
+        numpyro.sample(name, lfm.MarginalLikelihood(system(rate, units={"time": "h"}), times[name]), obs=y[name])
+
+
+def test_sites_have_the_unit_of_the_model_and_one_kind_of_clock():
+    y = np.zeros((3, 1))
+    sites = {"a": Data([0.0, 1.0, 2.0], y, ("x",), {"time": "d"}), "b": ([0.0, 5.0, 9.0], y)}
+    bound, data, _ = bind_sites(two_sites, sites, None)
+    assert bound.site_models["a"].times.tolist() == [0.0, 24.0, 48.0] == data["a"].times.tolist()
+    assert bound.site_models["b"].times.tolist() == [0.0, 5.0, 9.0]
+    for zone in ("UTC", "Asia/Tokyo"):
+        mixed = {"a": (pd.DatetimeIndex(DATES), y), "b": (pd.DatetimeIndex(DATES, tz=zone), y)}
+        for order in (["a", "b"], ["b", "a"]):
+            with pytest.raises(ValueError, match="'b' have an offset from UTC, and those of 'a' have none"):
+                bind_sites(two_sites, {name: mixed[name] for name in order}, None)
+
+
+def test_series_with_and_without_an_offset_are_not_stacked():
+    series = {zone or "none": Data(pd.DatetimeIndex(DATES, tz=zone), np.zeros((3, 1)), ("x",), {"time": "h"})
+              for zone in ("UTC", None)}
+    with pytest.raises(ValueError, match="'UTC' have an offset"):
+        stack_series(series)
+
+
+def test_compact_dates_in_an_array_are_named():
+    with pytest.warns(UserWarning, match="20260130 .*plain numbers"):
+        bind_dates(model, np.array([20260130, 20260131, 20260201]), np.zeros((3, 1)), None, None)
+    for cells in ([20260130, 20260231], [20260130, 2026013106], ["20260130", ""], [20260130.5], []):
+        assert calendar_time.compact_dates(cells) is None
+    assert calendar_time.compact_dates([20260130.0, "20260131"])[1].day == 31
 
 
 REFUSALS = {

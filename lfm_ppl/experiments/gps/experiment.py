@@ -44,6 +44,8 @@ class GpsSettings(study.StudySettings):
     """Data and sizes of the study."""
 
     data: str | None = setting(None, "folder of SP3 files (default: simulated satellites)", metavar="FOLDER")
+    include: tuple[str, ...] | None = setting(None, "flagged positions of the files to use (default: none)",
+                                              choices=("predicted", "manoeuvres"), metavar="FLAG")
     satellites: tuple[str, ...] | None = setting(None, "names such as G05 G20 (default: all)", metavar="NAME")
     train_days: float = setting(3.0, "days of training data; the study predicts the remaining days", metavar="D")
     axes: str = setting("DYB", "axes of the small forces, oriented to the Sun or to the orbit",
@@ -58,13 +60,14 @@ def learning_tasks(settings: GpsSettings) -> list[Task]:
     Raises:
         ValueError, FileNotFoundError: as in `problem.arcs` and `problem.Arcs.arc`, or for an unknown satellite.
     """
-    data = problem.arcs(settings.data, settings.seed)
+    data = problem.arcs(settings.data, settings.seed, settings.include or ())
     names = tuple(data.positions)[:settings.most]
     if settings.satellites is not None:
         files = () if data.published is None else data.published.files
         names = orbits.check_satellites(settings.satellites, tuple(data.positions), files)
     shared = {"data": settings.data and str(Path(settings.data).resolve()), "train_days": settings.train_days,
-              "axes": settings.axes, "noise": NOISE, "weight": learning.WEIGHT}
+              "axes": settings.axes, "noise": NOISE, "weight": learning.WEIGHT,
+              **({"include": list(settings.include)} if settings.include else {})}
     tasks = []
     for name in names:
         try:
@@ -96,7 +99,8 @@ def prediction_tasks(settings: GpsSettings, results: Results) -> list[Task]:
     compared = list(inputs)[:settings.alternatives]
     tasks = [Task(f"predict/{name}", settings.seed, inputs[name]) for name in inputs]
     tasks += [Task(f"ways/{name}", settings.seed, inputs[name]) for name in compared]
-    remaining_days = problem.arcs(settings.data, settings.seed).times[-1] / 24.0 - settings.train_days
+    data = problem.arcs(settings.data, settings.seed, settings.include or ())
+    remaining_days = data.times[-1] / 24.0 - settings.train_days
     if remaining_days > 10 * _WINDOW:
         # Two windows of a quarter of a day, at two and at four sevenths of the remaining time.
         starts = [settings.train_days + share * remaining_days for share in (2 / 7, 4 / 7)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -78,19 +79,20 @@ def _sort_key(satellite: str) -> tuple[int, str]:
 
 
 @functools.lru_cache(maxsize=2)
-def arcs(folder: str | None, seed: int = 0) -> Arcs:
+def arcs(folder: str | None, seed: int = 0, include: Sequence[str] = ()) -> Arcs:
     """Return positions of all satellites in a folder of SP3 files, or of twelve simulated satellites on GPS orbits.
 
     Args:
         folder: folder of SP3 files; their satellites are ordered by constellation, GPS first. None simulates ten days.
         seed: seed of the simulation.
+        include: flagged positions of the files to use, see `lfm_ppl.orbits.read_sp3`.
 
     Raises:
         FileNotFoundError, ValueError: there are no files, or a file is invalid; the message has file and line.
     """
     if folder is None:
         return _simulated(seed)
-    ephemerides = orbits.read_sp3(Path(folder))
+    ephemerides = orbits.read_sp3(Path(folder), include=include)
     environment = orbits.Environment.over(ephemerides.epochs[0], 24.0 * ephemerides.days)
     positions = environment.celestial(ephemerides)
     times = (ephemerides.epochs - ephemerides.epochs[0]) / 3600.0

@@ -24,7 +24,7 @@ _MIN_PERIOD = 5.0
 def compute_or_refuse(compute: Callable[[Arc, Task], Result], task: Task) -> Result:
     """Return the result of a task and its CPU seconds, or the reason why the study leaves the satellite out."""
     settings, started = task.settings, time.process_time()
-    data = problem.arcs(settings["data"], task.seed)
+    data = problem.arcs(settings["data"], task.seed, settings.get("include", ()))
     try:
         arc = data.arc(settings["satellite"], settings["train_days"])
     except Unusable as reason:

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.gaussian_residuals import TURN
 
 
 class ObservationFamily(eqx.Module):
@@ -125,6 +126,11 @@ class ObservationFamily(eqx.Module):
     def angular(self) -> tuple[int, ...]:
         """Indices of angles: none."""
         return ()
+
+    @property
+    def period(self) -> float:
+        """Period of angles, of which there are none."""
+        return TURN
 
     @property
     def covariance(self) -> Any:
