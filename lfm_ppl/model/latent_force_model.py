@@ -274,9 +274,10 @@ class LatentForceModel(eqx.Module):
         """Return the reads of known inputs between observations, see `lfm_ppl.model.inputs.input_reads`."""
         functions = _integrated_functions(self._trace_functions()) if self._has_integrated_inputs else []
         # Inside of compiled code arithmetic on JAX arrays would give tracers.
-        tables = [[part if checks.traced(part) else np.asarray(part) for part in (rate.times, rate.values)]
-                  for _, rate in self.infusions]
-        of_infusions = [InputRead("previous", *table, 1.0, 0.0) for table in tables]
+        of_infusions = [
+            InputRead("previous", rate.times if checks.traced(rate.times) else np.asarray(rate.times),
+                      rate.values if checks.traced(rate.values) else np.asarray(rate.values), 1.0, 0.0)
+            for _, rate in self.infusions]
         return input_reads(functions, first, last) + of_infusions
 
     def _check_finite(self, time: Any) -> None:

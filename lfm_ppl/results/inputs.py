@@ -31,9 +31,10 @@ def to_dataset(inputs: Mapping[str, InputTable], units: Mapping[str, str] | None
 
     Doses have their number and their sum as attributes, and lengths of infusions, states and resets as coordinates.
     """
-    variables, coordinates = {}, {}
+    variables: dict[str, Any] = {}
+    coordinates: dict[str, Any] = {}
     for name, table in inputs.items():
-        attributes = {"interpolation": table.interpolation, **units_attribute([name], units)}
+        attributes: dict[str, Any] = {"interpolation": table.interpolation, **units_attribute([name], units)}
         if table.is_dose:
             attributes |= {"doses": len(table.times), "total": float(np.sum(table.values))}
         variables[name] = f"{name}_time", np.asarray(table.values), attributes
