@@ -66,18 +66,20 @@ class InputTable(NamedTuple):
         if later.resets is not None:
             first = min(first, later.resets.min(initial=np.inf))
         is_earlier = self.times < first
-        joined = self._replace(times=np.append(self.times[is_earlier], later.times),
-                               values=np.append(self.values[is_earlier], later.values))
-        for name in ("durations", "compartments"):
-            mine, theirs = getattr(self, name), getattr(later, name)
-            if mine is not None or theirs is not None:
-                mine = np.zeros(len(self.times), int) if mine is None else mine
-                theirs = np.zeros(len(later.times), int) if theirs is None else theirs
-                joined = joined._replace(**{name: np.append(mine[is_earlier], theirs)})  # type: ignore[arg-type]
-        if self.resets is not None or later.resets is not None:
-            mine, theirs = (np.zeros(0) if table.resets is None else table.resets for table in (self, later))
-            joined = joined._replace(resets=np.append(mine[mine < first], theirs))
-        return joined
+
+        def join(mine: np.ndarray | None, theirs: np.ndarray | None) -> np.ndarray | None:
+            """Return an array of both tables; None where neither has it, zeros where one has none."""
+            if mine is None and theirs is None:
+                return None
+            mine = np.zeros(len(self.times), int) if mine is None else mine
+            return np.append(mine[is_earlier], np.zeros(len(later.times), int) if theirs is None else theirs)
+
+        resets = self.resets
+        if later.resets is not None:
+            resets = later.resets if resets is None else np.append(resets[resets < first], later.resets)
+        return InputTable(np.append(self.times[is_earlier], later.times),
+                          np.append(self.values[is_earlier], later.values), self.interpolation,
+                          join(self.durations, later.durations), join(self.compartments, later.compartments), resets)
 
     def event_arrays(self) -> dict[tuple[str, str], tuple[np.ndarray, ...]]:
         """Return the arrays of the doses as events: kind and state -> times, values and durations."""

@@ -147,10 +147,9 @@ def _doses_of_column(table: Table, name: str, way: str, times: np.ndarray, colum
                              f"dose that repeats; read it as {way.removeprefix(DOSE)!r} without {ONCE!r}.")
         index = index[:1]
     elif "EVID" not in columns and len(index) == len(amounts) >= _FEWEST_REPEATED and np.ptp(amounts) == 0:
-        states_in_words = way.removeprefix(DOSE)
         checks.warn(f"{table.label}, column {name!r}{part}: all {len(index)} rows hold the same dose, so that "
                     f"{len(index)} doses of {amounts[0]:g} are given, {amounts.sum():g} in all. If the column repeats "
-                    f"one dose, given at the first time, say so: --events {name}:{states_in_words}{ONCE} "
+                    f"one dose, given at the first time, say so: --events {name}:{way.removeprefix(DOSE)}{ONCE} "
                     f"(inputs={{{name!r}: '{way}{ONCE}'}}).")
     states = way.removeprefix(DOSE).split(",")
     compartment = _compartments(table, columns.get("CMT"), name, states, index)

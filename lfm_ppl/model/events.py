@@ -225,6 +225,7 @@ class Infusion(Event):
         switch_times = _concatenate(starts, starts + durations)
         rates = self.rates + np.zeros(np.shape(self.times))
         changes = _concatenate(rates, -rates)
+        order: Any
         if checks.traced(switch_times):
             order: Any = jnp.argsort(jax.lax.stop_gradient(switch_times))
             times, values = switch_times[order], jnp.asarray(changes)[order].cumsum()
