@@ -55,7 +55,7 @@ class InputWeights(NamedTuple):
 
         int_0^h exp(J (h - s)) b(s) ds = first b(0) + middle b(h/2) + last b(h)
 
-    for b quadratic in time, however large J h is; where J h is small they are those of Simpson's rule.
+    for b quadratic in time, however large J h is. For a small J h they are the weights of Simpson's rule.
 
     Attributes:
         transition: exp(J h) (M, M).
