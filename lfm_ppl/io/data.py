@@ -14,7 +14,7 @@ from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, Data, InputTable, fill_bla
 from lfm_ppl.io.data_set import stack_series as stack_series
 from lfm_ppl.io.missing_codes import warn_of_codes
 from lfm_ppl.io.table import Table, is_missing
-from lfm_ppl.utils import calendar_time, checks
+from lfm_ppl.utils import calendar_time, checks, date_warnings
 
 
 def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column: str | None = None,
@@ -225,10 +225,13 @@ def _times(table: Table, name: str, unit: str | None,
         if unit or _names_dates(name):
             cells = np.array(dates, object)
         else:
-            calendar_time.warn_of_compact_dates(table.location(0, name), cells[0], dates[0])
+            date_warnings.warn_of_compact_dates(table.location(0, name), cells[0], dates[0])
     if calendar_time.is_date(cells[0]):
-        times, origin, unit = calendar_time.numbers_of(name, cells, unit or named_unit or usual,
-                                                       lambda row: table.location(row, name))
+        def location(row: int) -> str:
+            return table.location(row, name)
+
+        times, origin, unit = calendar_time.numbers_of(name, cells, unit or named_unit or usual, location)
+        date_warnings.warn_of_changed_clock(location, times, origin, unit)
     else:
         times = table.numbers(name, "expected a finite number, or a date as 2026-03-31 in every row, got {}.")
         if named_unit and unit and calendar_time.UNITS[unit] != named_unit:
@@ -236,7 +239,7 @@ def _times(table: Table, name: str, unit: str | None,
                              f"(time_unit=) says {unit}.")
         unit = named_unit or unit
         if unit is None and dates is None and _names_dates(name):
-            calendar_time.warn_of_serial_dates(table.location(0, name), times)
+            date_warnings.warn_of_serial_dates(table.location(0, name), times)
     return times, unit, origin
 
 

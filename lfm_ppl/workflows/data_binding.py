@@ -18,7 +18,7 @@ from lfm_ppl.io.data_set import Data, at_origin, in_unit, keywords_by_site, mode
 from lfm_ppl.io.table import is_table
 from lfm_ppl.model.events import Event
 from lfm_ppl.model.inputs import Input
-from lfm_ppl.utils import calendar_time, checks
+from lfm_ppl.utils import calendar_time, checks, date_warnings
 
 
 def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
@@ -40,6 +40,7 @@ def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
     origin, unit = (None, "") if data is None else (data.origin, data.units.get("time", ""))
     if calendar_time.holds_dates(times):
         times, origin, unit = calendar_time.numbers_of("times", times)
+        date_warnings.warn_of_changed_clock("times[{}]".format, times, origin, unit)
     elif data is None:
         _warn_of_compact_dates("times", times)
     values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
@@ -65,7 +66,7 @@ def _warn_of_compact_dates(name: str, times: Any) -> None:
     """Warn of an array of whole numbers that are all dates YYYYMMDD."""
     if np.ndim(times) == 1 and not checks.traced(times) and np.asarray(times).dtype.kind in "iuf":
         if (dates := calendar_time.compact_dates(times)) is not None:
-            calendar_time.warn_of_compact_dates(name, np.asarray(times)[0], dates[0])
+            date_warnings.warn_of_compact_dates(name, np.asarray(times)[0], dates[0])
 
 
 def _check_unit_of_inputs(model_kwargs: Mapping[str, Any] | None, data: Data | None, unit: str,
