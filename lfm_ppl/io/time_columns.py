@@ -106,12 +106,12 @@ def check_clock(table: Table, time_name: str, used: Collection[str]) -> None:
     def goes_back() -> bool:
         return bool((np.diff(table.frame[time_name].astype(float)) < 0).any())
 
-    others = [name for name in table.frame if name != time_name and name not in used]
+    unused = [name for name in table.frame if name != time_name and name not in used]
     pair = None
     if holds_hours(time_name, goes_back):
-        pair = next(((name, time_name) for name in others if holds_days(name)), None)
+        pair = next(((name, time_name) for name in unused if holds_days(name)), None)
     elif holds_days(time_name):
-        pair = next(((time_name, name) for name in others if holds_hours(name, repeats_days)), None)
+        pair = next(((time_name, name) for name in unused if holds_hours(name, repeats_days)), None)
     if pair is not None:
         date, hour = (table.frame[name].iloc[0] for name in pair)
         raise ValueError(f"{table.label}: the date stands in the column {pair[0]!r} ({date}) and the time of day in "

@@ -73,7 +73,7 @@ def _check_unit_of_inputs(model_kwargs: Mapping[str, Any] | None, data: Data | N
                           model_unit: str) -> None:
     """Raise ValueError where a known input or dose of the data, in their unit, is an argument of a model in another.
 
-    Warn of other ones where times are numbers: those of the data are converted, and nothing says what theirs count.
+    Warn of other ones where times are numbers: the data are converted, and the unit of these inputs is not known.
     """
     def is_event_or_input(value: Any) -> bool:
         return isinstance(value, Input | Event)
@@ -85,8 +85,7 @@ def _check_unit_of_inputs(model_kwargs: Mapping[str, Any] | None, data: Data | N
     for member in members:
         if any(np.array_equal(member.times, table.times) for table in data.inputs.values()):
             raise ValueError(f"model_kwargs hold a known input or doses of the data with times in {unit}, and the "
-                             f"model counts {model_unit}. Leave them out: those of the data are converted, and passed "
-                             "to the model.")
+                             f"model counts {model_unit}. Leave them out: the model gets those of the data, converted.")
     if data.origin is None:
         checks.warn(f"the times of the data are converted from {unit} to {model_unit}, the unit of the model. The "
                     f"times of known inputs and doses in model_kwargs are not, and are taken to be in {model_unit}.")
