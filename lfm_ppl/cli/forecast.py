@@ -117,8 +117,8 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
         name: read.inputs[column] for name, (column, _) in columns.items() if column in read.inputs})
     read = in_unit(read, unit) if observed.origin is None else at_origin(read, observed.origin, unit)
     if observed.origin is None and read.units.get("time", unit) != unit:
-        raise ValueError(f"{path}: its times are in {read.units['time']}, and those of the result in "
-                         f"{unit or 'no known unit'}, to which they cannot be converted.")
+        raise ValueError(f"{path}: its times are in {read.units['time']}, which cannot be converted to the unit of the "
+                         f"result, {unit or 'none'}.")
     if repeated_rows := int(np.isin(read.times, observed.times).sum()):
         print(f"note     {repeated_rows} of {len(read.times)} rows of {path} are at times of the fitted data: if they "
               "are the same data, their scores are not scores of a forecast")

@@ -46,7 +46,7 @@ def _refuse_empty(hint: Any, value: Any) -> None:
         raise ValueError("The value is empty.")
 
 
-def _check_time_unit(unit: str | None) -> None:
+def _check_time_unit(hint: Any, unit: str | None) -> None:
     if unit is not None:
         from lfm_ppl.utils import calendar_time, checks
 
@@ -70,6 +70,7 @@ Text = Annotated[str, Parameter(validator=_refuse_empty)]
 File = Annotated[Text, Parameter(metavar="FILE")]
 Folder = Annotated[Text, Parameter(metavar="DIR")]
 Name = Annotated[Text, Parameter(metavar="NAME")]
+TimeUnit = Annotated[str, Parameter(metavar="UNIT", validator=_check_time_unit)]
 Names = Annotated[Text, Parameter(metavar="A,B,...")]
 Pairs = Annotated[tuple[str, ...], Parameter(metavar="NAME=VALUE", validator=_refuse_empty)]
 Count = Annotated[int, Parameter(metavar="N", converter=_integer(1))]
@@ -167,7 +168,7 @@ class DataOptions:
     series: Name | None = None
     """fit each series separately: the rows with the same value in this column; all together if the model is a panel"""
     columns: Annotated[Columns, Parameter(name="*")] = Columns()
-    time_unit: Annotated[Text, Parameter(metavar="UNIT")] | None = None
+    time_unit: TimeUnit | None = None
     """unit of the times in the file: ms, s, min, h, d, weeks, years (default: the model's; of dates else by the gaps);
     they are converted to the unit of the model, which --until, --at and the results have"""
     truth: File | None = None
@@ -175,11 +176,10 @@ class DataOptions:
     "state" or "parameters\""""
 
     def __post_init__(self) -> None:
-        """Refuse an unknown unit, and files that are series at the same time."""
+        """Refuse files that are series at the same time."""
         if self.each and self.series is not None:
             raise ValueError("--each is for one series in each file, --series for several in one file; give one of "
                              "them.")
-        _check_time_unit(self.time_unit)
 
 
 @_options_of("inference")
@@ -340,7 +340,7 @@ class ForecastOptions(Output):
     """CSV file of data that the fit did not use; they are predicted and scored; the outputs may all be empty where the
     file has known inputs"""
     columns: Annotated[Columns, Parameter(name="*")] = Columns()
-    time_unit: Annotated[Text, Parameter(metavar="UNIT")] | None = None
+    time_unit: TimeUnit | None = None
     """unit of the times in that file (default: that of the fit)"""
     draws: Count = 400
     """number of posterior draws"""
@@ -348,10 +348,6 @@ class ForecastOptions(Output):
     """random seed of paths and noise"""
     model: File | None = None
     """the model file, if it is not stored in the result"""
-
-    def __post_init__(self) -> None:
-        """Refuse an unknown unit."""
-        _check_time_unit(self.time_unit)
 
 
 @_GENERAL

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lfm_ppl.io import dosing
+from lfm_ppl.io import dosing, time_columns
 from lfm_ppl.io import table as tables
 from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, Data, InputTable, fill_blanks
 from lfm_ppl.io.data_set import stack_series as stack_series
 from lfm_ppl.io.missing_codes import warn_of_codes
-from lfm_ppl.io.table import Table, is_missing
+from lfm_ppl.io.series_columns import check_order
+from lfm_ppl.io.table import Table
 from lfm_ppl.utils import calendar_time, checks
+
+_ROW_NAMES = re.compile(r"|Unnamed: \d+(\.\d+)*|row\W?names|replicate", re.IGNORECASE)
+"""Names of columns that pandas, R and spreadsheets give to numbers of rows, and of replicates: no outputs."""
 
 
 def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column: str | None = None,
@@ -168,7 +172,7 @@ def _read(table: Table, outputs: Sequence[str] | None, time_column: str | None,
     has_doses = any(way.startswith(DOSE) for way in interpolations.values())
     events = dosing.event_columns(table, interpolations, outputs or ()) if has_doses or outputs else {}
     interpolations = {name: way for name, way in interpolations.items() if way not in dosing.ROLES}
-    time_name = _time_column(table, time_column)
+    time_name = time_columns.find_time_column(table, time_column)
     columns = [name for name in table.frame if name != time_name]
     names = list(outputs) if outputs is not None else [
         name for name in columns if name not in interpolations and not _ROW_NAMES.fullmatch(name)
@@ -184,9 +188,9 @@ def _read(table: Table, outputs: Sequence[str] | None, time_column: str | None,
                          f"{list(interpolations)}.")
     used = {*interpolations, *events.values(), *(names if outputs is not None or len(names) == 1 else ())}
     free = [] if part else [name for name in columns if name not in used]
-    _check_clock(table, time_name, {*interpolations, *events.values(), *(outputs or ())})
-    times, unit, origin = _times(table, time_name, time_unit, usual_unit)
-    _check_order(table, time_name, times, free, outputs is not None)
+    time_columns.check_clock(table, time_name, {*interpolations, *events.values(), *(outputs or ())})
+    times, unit, origin = time_columns.read_times(table, time_name, time_unit, usual_unit)
+    check_order(table, time_name, times, free, outputs is not None)
     y = np.column_stack([table.numbers(name) for name in names])
     y[dosing.is_unobserved(table, events)] = np.nan
     if observed and np.isnan(y).all():
@@ -198,126 +202,6 @@ def _read(table: Table, outputs: Sequence[str] | None, time_column: str | None,
     return Data(times, y, tuple(names), units={"time": unit} if unit else {}, origin=origin, inputs={
         name: dose_tables[name] if name in doses else _input(table, name, interpolation, times)
         for name, interpolation in interpolations.items()})
-
-
-def _time_column(table: Table, time_column: str | None) -> str:
-    header = list(table.frame)
-    if time_column is not None and time_column not in header:
-        unknown = checks.unknown("time column", time_column, header, checks.ABBREVIATIONS)
-        raise ValueError(f"{table.label}: {unknown}")
-    first_cells = {name: next((cell for cell in table.frame[name] if not is_missing(cell)), None) for name in header}
-    candidates = ([name for name in header if name == time_column]
-                  or [name for name in header if name.lower() == "time" or name == "t" or _unit_of(name)]
-                  or [name for name in header if name.lower() in ("date", "datetime", "timestamp")]
-                  or [name for name in header if calendar_time.is_date(first_cells[name])]
-                  or [name for name in header if _names_dates(name)
-                      and calendar_time.compact_dates(table.frame[name]) is not None])
-    if len(candidates) != 1:
-        problem = f"several time columns: {', '.join(candidates)}" if candidates else (
-            f"no time column; expected `time`, `t`, `time_h`, or one of dates, got the columns {', '.join(header)}"
-            + (", which are numbers: a first row of names may be missing" if all(map(_is_number, header)) else ""))
-        raise ValueError(f"{table.label} has {problem}. Name it with --time-column (time_column=).")
-    return candidates[0]
-
-
-def _unit_of(time_name: str) -> str | None:
-    """Return h for ``time_h``, None where the name has no unit."""
-    stem, _, unit = time_name.partition("_")
-    return calendar_time.UNITS.get(unit) if stem.lower() == "time" else None
-
-
-def _names_dates(time_name: str) -> bool:
-    """Return whether the name of a column says that it holds dates."""
-    return bool(_words(time_name) & _DATES)
-
-
-def _times(table: Table, name: str, unit: str | None,
-           usual: str | None) -> tuple[np.ndarray, str | None, str | None]:
-    """Return times (T,), their unit and their origin, None where the table does not say, see `read_csv`."""
-    cells = table.frame[name].to_numpy()
-    if (rows := np.flatnonzero([is_missing(cell) for cell in cells])).size:
-        raise ValueError(f"{table.location(rows[0], name)}: the time is missing.")
-    named_unit, origin = _unit_of(name), None
-    if (dates := calendar_time.compact_dates(cells)) is not None:
-        if unit or _names_dates(name):
-            cells = np.array(dates, object)
-        else:
-            calendar_time.warn_of_compact_dates(table.location(0, name), cells[0], dates[0])
-    if calendar_time.is_date(cells[0]):
-        times, origin, unit = calendar_time.numbers_of(name, cells, unit or named_unit or usual,
-                                                       lambda row: table.location(row, name))
-    else:
-        times = table.numbers(name, "expected a finite number, or a date as 2026-03-31 in every row, got {}.")
-        if named_unit and unit and calendar_time.UNITS[unit] != named_unit:
-            raise ValueError(f"{table.label}: the column {name!r} says that its unit is {named_unit}, and --time-unit "
-                             f"(time_unit=) says {unit}.")
-        unit = named_unit or unit
-        if unit is None and dates is None and _names_dates(name):
-            calendar_time.warn_of_serial_dates(table.location(0, name), times)
-    return times, unit, origin
-
-
-def _check_clock(table: Table, time_name: str, used: Collection[str]) -> None:
-    """Raise ValueError where date and time of day stand in two columns.
-
-    The time of day is a text such as 06:30, or a number in a column of hours, where dates repeat or the hours go back.
-    It stands beside dates without it. ``used`` are the outputs and inputs, which hold no time.
-    """
-    def matches(pattern: re.Pattern, name: str) -> bool:
-        return all(pattern.fullmatch(str(cell).strip()) for cell in table.frame[name])
-
-    def holds_days(name: str) -> bool:
-        return matches(_DAY, name) or _names_dates(name) and matches(_COMPACT_DAY, name)
-
-    def holds_hours(name: str, has_evidence: Callable[[], bool]) -> bool:
-        if matches(_TIME_OF_DAY, name):
-            return True
-        numbers = map(_as_number, table.frame[name]) if _words(name) & _HOURS else [None]
-        return all(number is not None and 0 <= number <= 24 for number in numbers) and has_evidence()
-
-    def repeats_days() -> bool:
-        return table.frame[time_name].nunique() < len(table.frame)
-
-    def goes_back() -> bool:
-        return bool((np.diff(table.frame[time_name].astype(float)) < 0).any())
-
-    others = [name for name in table.frame if name != time_name and name not in used]
-    pair = None
-    if holds_hours(time_name, goes_back):
-        pair = next(((name, time_name) for name in others if holds_days(name)), None)
-    elif holds_days(time_name):
-        pair = next(((time_name, name) for name in others if holds_hours(name, repeats_days)), None)
-    if pair is not None:
-        date, hour = (table.frame[name].iloc[0] for name in pair)
-        raise ValueError(f"{table.label}: the date stands in the column {pair[0]!r} ({date}) and the time of day in "
-                         f"{pair[1]!r} ({hour}); write them in one column, such as 2026-03-31T18:00.")
-
-
-def _check_order(table: Table, time_name: str, times: np.ndarray, free: Sequence[str], is_unused: bool) -> None:
-    """Raise ValueError where the time goes back, or where several series seem to stand in one table.
-
-    ``free`` are the columns that may hold identifiers of series; ``is_unused``: see `_merged_series_column`.
-    """
-    cells = table.frame[time_name].to_numpy()
-    rows = np.flatnonzero(np.diff(times) < 0)
-    series = _series_column(table, times, free) if rows.size else _merged_series_column(
-        table, times, free, is_unused)
-    if series is not None:
-        labels = table.frame[series].astype(str).to_numpy()
-        row = (rows if rows.size else np.flatnonzero(labels[1:] != labels[:-1]))[0] + 1
-        change = f"the column {series!r} changes from {labels[row - 1]} to {labels[row]}"
-        if rows.size:
-            change = f"the time goes back from {cells[row - 1]} to {cells[row]}, where {change}"
-        otherwise = "" if rows.size else (" If it names outputs, give each of them a column; else leave the column "
-                                          "out of the file or table.")
-        raise ValueError(f"{table.label}, row {table.frame.index[row]}: {change}. If "
-                         f"it names several series, fit them separately: --series {series} (lfm.data.read_series("
-                         f"path, {series!r}), or lfm.read_table of each part of a DataFrame).{otherwise}")
-    if rows.size:
-        row = rows[0] + 1
-        raise ValueError(f"{table.label}, row {table.frame.index[row]}: the time goes back from {cells[row - 1]} to "
-                         f"{cells[row]}. Sort the rows by time; replicates are rows with the same time. A clock that "
-                         "is set back for winter needs offsets from UTC.")
 
 
 def _input(table: Table, name: str, interpolation: str, times: np.ndarray) -> InputTable:
@@ -336,114 +220,3 @@ def _input(table: Table, name: str, interpolation: str, times: np.ndarray) -> In
     if (other_rows := rows[values[rows] != first_values[inverse]]).size:
         raise ValueError(f"{table.location(other_rows[0], name)}: the known input has another value at the same time.")
     return InputTable(unique_times, first_values, "previous" if interpolation == "zero" else interpolation)
-
-
-_DATES = frozenset(("date", "dates", "datetime", "timestamp", "yyyymmdd", "yyyymmddhh", "yyyymmddhhmm", "ymd", "datum"))
-"""Words in the names of columns of dates."""
-
-_ROW_NAMES = re.compile(r"|Unnamed: \d+(\.\d+)*|row\W?names|replicate", re.IGNORECASE)
-"""Names of columns that pandas, R and spreadsheets give to numbers of rows, and of replicates: no outputs."""
-
-_HOURS = frozenset(("time", "hour", "hours", "hh", "hr", "clock"))
-"""Words in the names of columns of times of day."""
-
-_DAY = re.compile(r"(\d{4}[-/.]\d\d?[-/.]\d\d?|\d\d?[-/.]\d\d?[-/.]\d{2,4})( 00:00:00)?")
-_COMPACT_DAY = re.compile(r"\d{8}")
-_TIME_OF_DAY = re.compile(r"\d\d?:\d\d(:\d\d(\.\d*)?)?( ?[AaPp][Mm])?")
-
-_IDENTIFIERS = frozenset((
-    "id", "ids", "subject", "subj", "subjid", "subjectid", "usubjid", "patient", "patientid", "participant", "person",
-    "volunteer", "individual", "indiv", "animal", "animalid", "series", "group", "name", "who"))
-"""Words in the names of columns that identify the series of a row."""
-
-_SUBJECTS = _IDENTIFIERS | frozenset((
-    "mouse", "rat", "dog", "pig", "rabbit", "monkey", "sheep", "cow", "fish", "bird", "plant", "tree", "child",
-    "household", "customer", "cage", "plot", "tank", "well"))
-"""These, and words that also name measurements, such as the number of sheep."""
-
-_REPLICATES = frozenset(("replicate", "replicates", "replication", "rep", "reps", "repl", "repeat", "duplicate",
-                         "triplicate", "technical"))
-"""Words in the names of columns that number the measurements of one time."""
-
-
-def _words(name: str) -> set[str]:
-    """Return the words of a column's name, ``{"patient", "id"}`` for ``PatientID``; none of ``rat2``, a series."""
-    if re.search(r"\d", name):
-        return set()
-    return set(re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()))
-
-
-def _series_column(table: Table, times: np.ndarray, free: Sequence[str]) -> str | None:
-    """Return the column that seems to hold identifiers of series where the time goes back, None where there is none.
-
-    Its cells are filled, and the time does not go back among the rows that share a value. Unless its name is that of an
-    identifier, these rows stand together, and a value has two of them or more on average.
-    """
-    candidates = []
-    for name in free:
-        labels, index = np.unique(table.frame[name].astype(str), return_inverse=True)
-        order = np.argsort(index, kind="stable")
-        goes_back = (np.diff(times[order]) < 0) & (np.diff(index[order]) == 0)
-        # Replicates that stand one below the other are one series, to be sorted.
-        if _words(name) & _REPLICATES or len(labels) == 1 or goes_back.any() or any(
-                map(is_missing, table.frame[name])):
-            continue
-        if _words(name) & (_IDENTIFIERS | {"unit"}):
-            return name
-        if 1 + np.count_nonzero(np.diff(index)) == len(labels) <= len(index) / 2:
-            candidates.append(name)
-    return candidates[0] if candidates else None
-
-
-def _merged_series_column(table: Table, times: np.ndarray, free: Sequence[str], is_unused: bool) -> str | None:
-    """Return the column that seems to hold identifiers of series where the time never goes back.
-
-    Its cells are texts or whole numbers, all filled. Either its name is that of an identifier, and half of the rows or
-    more share their value with another row: a number of the row, or of an animal that is measured once, identifies no
-    series. Or its values tell rows of equal times apart, each of them at several times. A factor such as the weather
-    does not, as it is equal in rows of one time. Measurements that are whole numbers may tell rows apart, too, but not
-    with the same numbers at all times.
-
-    Args:
-        table: the table.
-        times: (T,).
-        free: the columns that may hold identifiers.
-        is_unused: whether these columns are known to be no outputs.
-    """
-    _, instant = np.unique(times, return_inverse=True)
-    for name in free:
-        words, cells = _words(name), table.frame[name]
-        kind = None if words & _REPLICATES else _kind_of_labels(cells)
-        if kind is None or any(map(is_missing, cells)):
-            continue
-        labels, index, counts = np.unique(cells.astype(str), return_inverse=True, return_counts=True)
-        if len(labels) == 1:
-            continue
-        identifiers = _SUBJECTS if is_unused or kind is str else _IDENTIFIERS
-        if words & identifiers and counts[counts > 1].sum() >= len(index) / 2:
-            return name
-        rows = np.zeros((instant.max() + 1, len(labels)), int)
-        np.add.at(rows, (instant, index), 1)
-        is_shared = np.count_nonzero(rows, axis=1) > 1
-        if rows.max() == 1 and is_shared.sum() > 1 and counts.min() > 1 and (kind is str or rows.all()):
-            return name
-    return None
-
-
-def _kind_of_labels(cells: Any) -> type | None:
-    """Return str or int where all cells of a column are texts or whole numbers, else None."""
-    if all(_as_number(cell) is None for cell in cells):
-        return str
-    numbers = map(_as_number, cells)
-    return int if all(number is not None and number == int(number) for number in numbers) else None
-
-
-def _is_number(cell: Any) -> bool:
-    return _as_number(cell) is not None
-
-
-def _as_number(cell: Any) -> float | None:
-    try:
-        return float(cell) if np.isfinite(float(cell)) else None
-    except (TypeError, ValueError):
-        return None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lfm_ppl.utils import calendar_time, checks
+from lfm_ppl.utils import calendar_time, checks, date_warnings
 
 if TYPE_CHECKING:
     from lfm_ppl.model.events import Event
@@ -148,6 +148,7 @@ class Data:
             if unit:
                 checks.one_of('units["time"]', unit, calendar_time.SECONDS)
             numbers, midnight, units["time"] = calendar_time.numbers_of("times", times, unit)
+            date_warnings.warn_of_changed_clock("times[{}]".format, numbers, midnight, units["time"])
             times = calendar_time.positions("times", times, origin, units["time"]) if origin else numbers
             origin = origin or midnight
         times, y = (np.asarray(checks.unmask(values), float) for values in (times, self.y))

@@ -59,6 +59,26 @@ def is_missing(cell: Any) -> bool:
     return cell is None or type(cell).__name__ == "NAType" or bool(cell != cell)  # NaN, and pandas' NaT
 
 
+def words_of(name: str) -> set[str]:
+    """Return the words of a column's name, ``{"patient", "id"}`` for ``PatientID``; none of ``rat2``, a series."""
+    if re.search(r"\d", name):
+        return set()
+    return set(re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()))
+
+
+def is_number(cell: Any) -> bool:
+    """Return whether a cell is a finite number, or the text of one."""
+    return as_number(cell) is not None
+
+
+def as_number(cell: Any) -> float | None:
+    """Return the finite number in a cell, None where there is none."""
+    try:
+        return float(cell) if np.isfinite(float(cell)) else None
+    except (TypeError, ValueError):
+        return None
+
+
 def _number(cell: Any) -> float:
     """Return the number in a cell, NaN where it is missing and infinity where there is none."""
     try:

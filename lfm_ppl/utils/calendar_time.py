@@ -23,11 +23,6 @@ _SMALLEST_GAPS = {"years": 300 * 86400.0, "d": 86400.0, "h": 3600.0, "min": 60.0
 _ISO_DATE = re.compile(r"\s*(?=.*[-:])\d{4}-?\d\d-?\d\d([\sT][\d:.]*)?\s*(?P<offset>Z|[+-]\d\d:?(\d\d)?)?\s*")
 _COMPACT_DATE = re.compile(r"(?P<year>(1[7-9]|2[01])\d\d)(?P<month>0[1-9]|1[0-2])(?P<day>0[1-9]|[12]\d|3[01])"
                            r"((?P<hour>[01]\d|2[0-3]|24(?=$|00$))(?P<minute>[0-5]\d)?)?")
-_FIRST_SERIAL, _LAST_SERIAL = 20000.0, 73050.0
-"""Serial dates of 1954 and of 2099 in a spreadsheet."""
-
-_MONTHS_OF_CHANGES = (3, 4, 9, 10, 11)
-"""Months in which clocks change to or from summer time, on Sundays."""
 _CLOCK: ContextVar[tuple[str, str] | None] = ContextVar("clock", default=None)
 
 
@@ -59,27 +54,6 @@ def compact_dates(cells: Any) -> list[datetime] | None:
         except ValueError:  # no such day
             return None
     return dates or None
-
-
-def warn_of_compact_dates(label: str, number: Any, date: datetime) -> None:
-    """Warn of whole numbers that are all compact dates and are read as numbers."""
-    from lfm_ppl.utils import checks  # which imports this module
-
-    text = number if isinstance(number, str) else _digits(number)
-    checks.warn(f"{label}: {text} and all other times are dates YYYYMMDD, with or without HH or HHMM, and are read as "
-                "plain numbers. If they are dates, name the column `date` or give --time-unit d (time_unit='d'); in "
-                f"arrays, write np.datetime64('{date.isoformat(timespec='minutes')}').")
-
-
-def warn_of_serial_dates(label: str, times: np.ndarray) -> None:
-    """Warn of numbers that may be days since 1899-12-30, as spreadsheets count them."""
-    from lfm_ppl.utils import checks  # which imports this module
-
-    if _FIRST_SERIAL <= times.min() and times.max() <= _LAST_SERIAL:
-        date = datetime(1899, 12, 30) + timedelta(days=float(times[0]))
-        checks.warn(f"{label}: {times[0]:g} is read as a plain number. In a spreadsheet it is a date, "
-                    f"{date.isoformat(sep=' ', timespec='minutes')}: save the column in the form 2026-03-31 18:00; or "
-                    "give the unit of the numbers, --time-unit d (time_unit='d').")
 
 
 def _digits(cell: Any) -> str:
@@ -145,50 +119,8 @@ def numbers_of(name: str, values: Any, unit: str | None = None,
     seconds = (dates - midnight).total_seconds().to_numpy()
     gaps = np.diff(seconds)
     gap = np.median(gaps[gaps > 0]) if (gaps > 0).any() else 0.0
-    if dates.tz is None and cells.ndim == 1:
-        _warn_of_changed_clock(location or (lambda row: f"{name}[{row}]"), dates, gap)
     unit = UNITS[unit] if unit else next(name for name, smallest in _SMALLEST_GAPS.items() if gap >= smallest)
     return (seconds / SECONDS[unit]).reshape(cells.shape), midnight.isoformat(), unit
-
-
-def _warn_of_changed_clock(location: Callable[[int], str], dates: Any, step: float) -> None:
-    """Warn of an hour that occurs twice, or not at all, as on a clock that changes to or from summer time.
-
-    The hour lies in the night of a Sunday, and the rows around it are ``step`` apart, in seconds, at most one hour.
-    """
-    from lfm_ppl.utils import checks  # which imports this module
-
-    instants, counts = np.unique(dates.to_numpy(), return_counts=True)
-    if not 0 < step <= 3600 or len(instants) < 3:
-        return
-    hours, gaps = instants.astype("M8[h]"), np.diff(instants) / np.timedelta64(1, "s")
-    repeated_hours = np.unique(hours[counts > 1])
-    is_rare = counts.max() == 2 and 2 * np.count_nonzero(counts == 2) < len(counts)
-    for hour in repeated_hours[:2] if is_rare else ():
-        if _may_change(hour) and (counts[hours == hour] == 2).all():
-            text = str(hour.astype("M8[m]"))
-            label = location(int(np.argmax(dates.to_numpy().astype("M8[h]") == hour)))
-            checks.warn(f"{label}: the hour from {text} occurs twice, and its rows are read as replicates. If the "
-                        "clock was set back there, they are an hour apart: give all times their offset, such as "
-                        f"{text}+02:00 and {text}+01:00.")
-            return
-    for index in np.flatnonzero(np.isclose(gaps, step + 3600)):
-        earlier, later = instants[index:index + 2].astype("M8[m]")
-        hour = (earlier + np.timedelta64(round(step), "s")).astype("M8[h]")
-        neighbours = np.append(gaps[max(index - 1, 0):index], gaps[index + 1:index + 2])
-        if _may_change(hour) and earlier < hour and np.allclose(neighbours, step):
-            label = location(int(np.argmax(dates.to_numpy() == instants[index + 1])))
-            checks.warn(f"{label}: the hour from {hour.astype('M8[m]')} is skipped, and {earlier} and {later} are read "
-                        f"as {gaps[index] / 60:g} min apart. If the clock was set forward there, they are "
-                        f"{step / 60:g} min apart: give all times their offset from UTC, such as {earlier}+01:00 and "
-                        f"{later}+02:00.")
-            return
-
-
-def _may_change(hour: np.datetime64) -> bool:
-    """Return whether clocks may change to or from summer time in an hour."""
-    stamp = hour.astype(datetime)
-    return stamp.weekday() == 6 and stamp.month in _MONTHS_OF_CHANGES and stamp.hour <= 3
 
 
 def check_offsets(origins: Mapping[str, str | None]) -> None:

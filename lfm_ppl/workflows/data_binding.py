@@ -18,7 +18,7 @@ from lfm_ppl.io.data_set import Data, at_origin, in_unit, keywords_by_site, mode
 from lfm_ppl.io.table import is_table
 from lfm_ppl.model.events import Event
 from lfm_ppl.model.inputs import Input
-from lfm_ppl.utils import calendar_time, checks
+from lfm_ppl.utils import calendar_time, checks, date_warnings
 
 
 def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
@@ -40,6 +40,7 @@ def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
     origin, unit = (None, "") if data is None else (data.origin, data.units.get("time", ""))
     if calendar_time.holds_dates(times):
         times, origin, unit = calendar_time.numbers_of("times", times)
+        date_warnings.warn_of_changed_clock("times[{}]".format, times, origin, unit)
     elif data is None:
         _warn_of_compact_dates("times", times)
     values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
@@ -65,14 +66,14 @@ def _warn_of_compact_dates(name: str, times: Any) -> None:
     """Warn of an array of whole numbers that are all dates YYYYMMDD."""
     if np.ndim(times) == 1 and not checks.traced(times) and np.asarray(times).dtype.kind in "iuf":
         if (dates := calendar_time.compact_dates(times)) is not None:
-            calendar_time.warn_of_compact_dates(name, np.asarray(times)[0], dates[0])
+            date_warnings.warn_of_compact_dates(name, np.asarray(times)[0], dates[0])
 
 
 def _check_unit_of_inputs(model_kwargs: Mapping[str, Any] | None, data: Data | None, unit: str,
                           model_unit: str) -> None:
     """Raise ValueError where a known input or dose of the data, in their unit, is an argument of a model in another.
 
-    Warn of other ones where times are numbers: those of the data are converted, and nothing says what theirs count.
+    Warn of other ones where times are numbers: the data are converted, and the unit of these inputs is not known.
     """
     def is_event_or_input(value: Any) -> bool:
         return isinstance(value, Input | Event)
@@ -84,8 +85,7 @@ def _check_unit_of_inputs(model_kwargs: Mapping[str, Any] | None, data: Data | N
     for member in members:
         if any(np.array_equal(member.times, table.times) for table in data.inputs.values()):
             raise ValueError(f"model_kwargs hold a known input or doses of the data with times in {unit}, and the "
-                             f"model counts {model_unit}. Leave them out: those of the data are converted, and passed "
-                             "to the model.")
+                             f"model counts {model_unit}. Leave them out: the model gets those of the data, converted.")
     if data.origin is None:
         checks.warn(f"the times of the data are converted from {unit} to {model_unit}, the unit of the model. The "
                     f"times of known inputs and doses in model_kwargs are not, and are taken to be in {model_unit}.")

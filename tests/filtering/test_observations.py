@@ -64,6 +64,7 @@ def test_covariance_that_depends_on_the_state(rule, points):
     assert np.isclose(result.filtered_mean[0, 0], 0.2 + 0.3 / s * 0.5, rtol=1e-10)
 
 
+@pytest.mark.filterwarnings("ignore:the angles 'y0' reach")
 def test_angles_are_compared_on_the_circle():
     """Whole turns of the data change nothing, in the residual and beyond."""
     plain, angular = (lfm.LatentForceModel(
