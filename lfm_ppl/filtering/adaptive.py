@@ -116,6 +116,7 @@ def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float
             assert step_error is not None
             mean_error, covariance_error = step_error
         else:
+            assert position.stage is not None
             factor = integrating_factor(ssm, dynamics.linear, h)
             step, stage4 = runge_kutta_step(dynamics, factor, rest_of_span, h, previous.moments, min_sd,
                                             stage1=position.stage)
