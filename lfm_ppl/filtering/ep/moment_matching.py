@@ -53,6 +53,9 @@ NEARLY_CONSTANT = 1e-13
 _FAR = 1e3
 """Distance in standard deviations from which a site's centre is moved."""
 
+_LARGEST_ROUNDING = 1e-10
+"""Rounding error of nu, in units of the marginal, from which a site's centre is moved: far below the tolerance."""
+
 _LEAST_PROBABILITY = 1e-15
 """Least probability of a residual, which then is -7.9."""
 
@@ -127,9 +130,12 @@ def sites_of_moments(cavity: MeanVariance, shift: jax.Array, variance: jax.Array
     """Return the sites by which a cavity gets other moments: the mean changes by ``shift``, arrays of one shape.
 
     The centre is the cavity's mean, or the new mean where that is many sds away: nu would be a large number there, and
-    log evidences differences of its squares.
+    log evidences differences of its squares. The same holds where the rounding of a predictor, as a share of the sd,
+    would move nu.
     """
-    is_far = shift**2 > _FAR**2 * variance
+    eps = jnp.finfo(variance.dtype).eps
+    is_far = ((shift**2 > _FAR**2 * variance)
+              | (eps * jnp.abs(shift * (cavity.mean + shift)) > _LARGEST_ROUNDING * variance))
     return Sites(jnp.where(is_far, cavity.mean + shift, cavity.mean),
                  shift / jnp.where(is_far, cavity.variance, variance), 1.0 / variance - 1.0 / cavity.variance)
 
