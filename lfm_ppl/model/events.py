@@ -227,7 +227,7 @@ class Infusion(Event):
         changes = _concatenate(rates, -rates)
         order: Any
         if checks.traced(switch_times):
-            order: Any = jnp.argsort(jax.lax.stop_gradient(switch_times))
+            order = jnp.argsort(jax.lax.stop_gradient(switch_times))
             times, values = switch_times[order], jnp.asarray(changes)[order].cumsum()
         else:
             # The times of the table of an input increase.
