@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.user_functions import trace
+from lfm_ppl.model.user_functions import own_function, trace
 from lfm_ppl.utils import checks
 
 
@@ -109,7 +109,8 @@ def build_constraints(model: LatentForceModel, lower: Mapping[str, Any] | None, 
     _check_initial_state(model, lower, upper)
     if callable(functions):
         functions = (functions,)
-    functions = tuple(functions or ())
+    functions = tuple(own_function(function) if callable(function) and function.__hash__ is None else function
+                      for function in functions or ())
     # Labels lack the values of the bounds, which may be traced.
     labels = [*(f"{name} >= lower" for name in lower), *(f"{name} <= upper" for name in upper)]
     for number, function in enumerate(functions):

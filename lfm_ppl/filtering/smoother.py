@@ -144,14 +144,14 @@ class SmootherResult(eqx.Module):
         return jnp.moveaxis(_joint_draws(self, key, draws), -1, 0)
 
 
-@eqx.filter_jit
+@shared_jit
 def _joint_draws(result: SmootherResult, key: jax.Array, draws: int) -> jax.Array:
     """Return draws (K, n, draws) of the joint state."""
     errors = sample_errors(key, result._trace, draws)[result._requested]
     return result.mean[..., None] + errors
 
 
-@eqx.filter_jit
+@shared_jit
 def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
     matrix, offset = result._input_map
     inputs = jnp.moveaxis(matmul(matrix, _joint_draws(result, key, draws)) + offset[..., None], -1, 0)

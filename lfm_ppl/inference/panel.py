@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import copy
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -23,7 +22,7 @@ from lfm_ppl.filtering.arguments import as_rule
 from lfm_ppl.filtering.breakdown import FilterWarning
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA
-from lfm_ppl.filtering.stiffness import ExplicitSteps, has_explicit_steps, long_step, long_step_message
+from lfm_ppl.filtering.stiffness import has_explicit_steps, long_step, long_step_message
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, refuse_times_by_site, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
@@ -33,6 +32,7 @@ from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import check_times
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.batching import mapped
+from lfm_ppl.utils.programs import Program
 
 
 class Panel(dist.Distribution):
@@ -122,7 +122,6 @@ class Panel(dist.Distribution):
     def with_times(self, times: ArrayLike) -> Panel:
         """Return the same distribution with concrete times instead of traced ones."""
         panel = copy.copy(self)
-        panel.__dict__.pop("_explicit_steps", None)
         panel.times = times
         return panel
 
@@ -147,18 +146,14 @@ class Panel(dist.Distribution):
         self._warn_of_long_steps(y, log_likelihood)
         return log_likelihood
 
-    @functools.cached_property
-    def _explicit_steps(self) -> Callable[[jax.Array], ExplicitSteps]:
-        """Compiled function from y (B, T, D) to what limits the explicit steps of each series."""
-        return jax.jit(lambda y: self.mapped(lambda series, y: series.explicit_steps(y), y))
-
     def _warn_of_long_steps(self, y: jax.Array, log_likelihood: jax.Array) -> None:
         """Warn where a step of a series is too long for a fast decay, outside of compiled code."""
         first = self.first
         if checks.traced((self.parameters, self.times, log_likelihood)) or not has_explicit_steps(
                 first.ssm, first.rule, first.time_grid) or not np.isfinite(np.asarray(log_likelihood)).all():
             return
-        long = long_step(self._explicit_steps(y))
+        explicit_steps = Program(lambda y: self.mapped(lambda series, y: series.explicit_steps(y), y))
+        long = long_step(explicit_steps(y))
         if long is not None:
             checks.warn(long_step_message(long, first.model.state_names, first.steps), FilterWarning)
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import re
+from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextvars import ContextVar
 from typing import Any
@@ -40,6 +41,9 @@ from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, late
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.programs import Program
 
+_MOST_STRUCTURES = 32
+"""Structures of a model whose programs are kept for further data sets."""
+
 _SITEWISE_STRATEGIES = (init_to_median, init_to_sample)
 """Initialisation strategies that depend on a site alone, so that they can be compiled."""
 
@@ -59,7 +63,8 @@ class SharedPrograms:
     """
 
     def __init__(self) -> None:
-        self.by_structure: dict[Hashable, dict[Hashable, Any] | None] = {}  # None: programs need the arguments' values
+        # None where programs need the values of the arguments.
+        self.by_structure: OrderedDict[Hashable, dict[Hashable, Any] | None] = OrderedDict()
 
     def __reduce__(self) -> tuple[type[SharedPrograms], tuple]:
         """Leave the programs out, which belong to one process."""
@@ -219,6 +224,9 @@ class TracedModel:
         by_structure = (_programs_in_use.get() or SharedPrograms()).by_structure
         if key not in by_structure:
             by_structure[key] = {} if self._is_traceable(arguments) else None
+            if len(by_structure) > _MOST_STRUCTURES:
+                by_structure.popitem(last=False)
+        by_structure.move_to_end(key)
         if (programs := by_structure[key]) is not None:
             self.programs, self.inputs = programs, inputs
         return self

@@ -36,6 +36,7 @@ from lfm_ppl.model.state_space import Span, StateSpaceModel, check_times, state_
 from lfm_ppl.model.stiff_simulation import divide_steps, exponential_change, warn_of_infinite_states
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import fastest_rate, matmul, semidefinite_root
+from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.random_keys import split_by_name
 
 LONGEST_PRODUCT = 1.0
@@ -146,7 +147,7 @@ class SimulationProgram:
     @functools.cached_property
     def compiled(self) -> Callable[..., tuple[Simulation, jax.Array]]:
         """`run`, compiled."""
-        return jax.jit(self.run)
+        return Program(self.run)
 
     def resolved(self, times: np.ndarray, start: float) -> SimulationProgram:
         """Return the program with breakpoints between which its steps resolve the fastest rate.

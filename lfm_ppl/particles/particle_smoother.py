@@ -176,7 +176,7 @@ def particle_smoother(key: jax.Array, model: LatentForceModel, times: ArrayLike,
     if (size := 8 * rows * particles * (ssm.state_dim + 2)) > _LARGEST_HISTORY:
         raise ValueError(f"the particles of {rows} rows would take {size / 2**30:.1f} GiB; smoothing keeps all of "
                          f"them. Take at most {particles * _LARGEST_HISTORY // size} particles, or fewer steps.")
-    states, indices, _ = shared_jit(draw_trajectories)(ssm, grid, y, key, settings, draws, method)
+    states, indices, _ = _compiled_draws(ssm, grid, y, key, settings, draws, method)
     distinct = np.array([len(np.unique(row)) for row in np.asarray(indices)])
     return ParticleSmootherResult(jnp.asarray(grid.requested_times, float), jnp.moveaxis(states, 0, 1),
                                   jnp.asarray(distinct), ssm, method, settings.scheme)
@@ -318,3 +318,6 @@ def _quantile_index(uniform: jax.Array, log_weights: jax.Array) -> jax.Array:
     cumulative = jnp.cumsum(jnp.exp(log_weights - log_weights.max()))
     index = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
     return jnp.minimum(index, log_weights.shape[0] - 1).astype(int)
+
+
+_compiled_draws = shared_jit(draw_trajectories)

@@ -12,6 +12,7 @@ from jax.scipy.special import logsumexp, ndtr
 from jax.scipy.stats import norm
 
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.programs import shared_jit
 
 _HALVINGS = 60
 """Bisection steps of a quantile; each halves the bracket."""
@@ -71,7 +72,7 @@ class Mixture(eqx.Module):
         return _quantiles(self, jnp.asarray(p))
 
 
-@eqx.filter_jit
+@shared_jit
 def _quantiles(mixture: Mixture, p: jax.Array) -> jax.Array:
     sd = jnp.sqrt(jnp.broadcast_to(mixture.variance, mixture.mean.shape))
     weights = jnp.exp(mixture.log_weights)[:, :, None]

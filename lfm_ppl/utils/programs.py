@@ -29,6 +29,7 @@ _MOST_PROGRAMS = 64
 """Programs that a function decorated by `shared_jit` keeps, one for each model and each value of its settings."""
 
 _executables: OrderedDict[Hashable, Any] = OrderedDict()
+_tables: list[OrderedDict[Hashable, Any]] = []
 _lock = threading.Lock()
 
 
@@ -60,9 +61,7 @@ class Program:
         return self._executable(arguments, *jax.tree.flatten(arguments))
 
     def _executable(self, arguments: tuple, leaves: list[Any], structure: Any) -> Callable:
-        arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
-        devices = [array.sharding for array in arrays] if jax.local_device_count() > 1 else []
-        kinds = structure, *devices, *map(_kind, leaves)
+        kinds = structure, _context(), *map(_kind, leaves)
         if kinds not in self._own:
             lowered = self._function.lower(*arguments)
             # A function that reads tracers has more inputs, and is a part of the outer program.
@@ -78,6 +77,7 @@ def shared_jit(function: Callable) -> Callable:
     """
     inlined = eqx.filter_jit(function)
     programs: OrderedDict[Hashable, Program] = OrderedDict()
+    _tables.append(programs)
 
     @functools.wraps(function)
     def call(*arguments: Any, **keywords: Any) -> Any:
@@ -91,12 +91,7 @@ def shared_jit(function: Callable) -> Callable:
 
         leaves, structure = jax.tree.flatten(constants)
         key = structure, *((type(leaf), leaf) for leaf in leaves)
-        if key not in programs:
-            programs[key] = Program(run)
-            if len(programs) > _MOST_PROGRAMS:
-                programs.popitem(last=False)
-        programs.move_to_end(key)
-        return programs[key](arrays)
+        return _remembered(programs, key, lambda: Program(run), _MOST_PROGRAMS)(arrays)
 
     return call
 
@@ -106,19 +101,35 @@ def _is_array(leaf: Any) -> bool:
 
 
 def forget_executables() -> None:
-    """Forget the executables that no `Program` holds, as `jax.clear_caches` does for JAX's own."""
-    _executables.clear()
+    """Forget the executables that no `Program` of a caller holds, as `jax.clear_caches` does for JAX's own."""
+    with _lock:
+        for table in (_executables, *_tables):
+            table.clear()
 
 
 def _compile(lowered: Any, kinds: Hashable) -> Any:
     key = hashlib.sha256(lowered.as_text().encode()).digest(), lowered.out_tree, kinds
+    return _remembered(_executables, key, lowered.compile, _MOST_EXECUTABLES)
+
+
+def _remembered(table: OrderedDict[Hashable, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:
+    """Return the entry of a table of the latest entries, made at the first call; threads may share the table."""
     with _lock:
-        if key not in _executables:
-            _executables[key] = lowered.compile()
-            if len(_executables) > _MOST_EXECUTABLES:
-                _executables.popitem(last=False)
-        _executables.move_to_end(key)
-        return _executables[key]
+        if key in table:
+            table.move_to_end(key)
+            return table[key]
+    entry = make()  # compilation is not serial
+    with _lock:
+        table[key] = entry
+        while len(table) > most:
+            table.popitem(last=False)
+    return entry
+
+
+def _context() -> Hashable:
+    """Return the settings of JAX that decide a program besides its arguments."""
+    config: Any = jax.config
+    return config.jax_enable_x64, config.jax_default_device, config.jax_default_matmul_precision
 
 
 def _inputs(lowered: Any) -> int:
@@ -129,5 +140,5 @@ def _inputs(lowered: Any) -> int:
 
 
 def _kind(leaf: Any) -> Hashable:
-    """Return shape and type of an argument; the attribute of a JAX array is ten times as fast as `jax.typeof`."""
-    return leaf.aval if isinstance(leaf, jax.Array) else jax.typeof(leaf)
+    """Return shape, type and devices of an argument; the attribute of a JAX array is faster than `jax.typeof`."""
+    return (leaf.aval, leaf.sharding) if isinstance(leaf, jax.Array) else jax.typeof(leaf)

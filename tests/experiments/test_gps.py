@@ -20,7 +20,7 @@ def data(monkeypatch):
     positions[:384, -1] = np.nan  # the last satellite has no position on the first four days
     table = orbits.Ephemerides(orbits.gps_seconds(2019, 4, 7) + 3600 * TIMES, names, positions, 900.0)
     arcs = problem.Arcs(None, TIMES, {name: positions[:, k] for k, name in enumerate(names)}, table)
-    monkeypatch.setattr(problem, "arcs", lambda folder, seed=0: arcs)
+    monkeypatch.setattr(problem, "arcs", lambda folder, seed=0, include=(): arcs)
     return arcs
 
 
@@ -71,7 +71,7 @@ def result(scale, eclipsed=False, complete=True):
 def test_tables(monkeypatch):
     predictions = {"G01": result(10.0), "G02": result(20.0, eclipsed=True), "G08": result(40.0, complete=False)}
     arcs = problem.Arcs(None, TIMES, {name: np.ones((960, 3)) for name in predictions}, None)
-    monkeypatch.setattr(problem, "arcs", lambda folder, seed=0: arcs)
+    monkeypatch.setattr(problem, "arcs", lambda folder, seed=0, include=(): arcs)
     settings = experiment.GpsSettings(alternatives=0)
     data = experiment.STUDY.collect(settings, {f"learn/{name}": learning_result() for name in predictions} | {
         f"predict/{name}": prediction for name, prediction in predictions.items()})
