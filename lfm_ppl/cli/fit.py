@@ -158,7 +158,7 @@ def _rows_of_doses(observed: Data) -> np.ndarray:
     """Return which rows (T,), or (B, T), hold a dose and no measurement; their empty outputs are no missing values."""
     is_dosed = np.zeros(observed.times.shape, bool)
     for name, table in observed.inputs.items():
-        if table.dosed_state:
+        if table.is_dose:
             label = name.partition(OF_SERIES)[2]
             series = observed.series.index(label) if label in observed.series else ...
             is_dosed[series] |= np.isin(observed.times[series], table.times)

@@ -99,7 +99,7 @@ def test_held_out_dates_are_counted_from_the_origin_of_the_fit(write):
 
 def test_rows_of_doses_are_no_missing_values(capsys):
     data = Data([0.0, 1.0, 2.0, 3.0], [[np.nan], [1.0], [np.nan], [2.0]], ("x",),
-                inputs={"AMT": ([0.0], [4.0], "dose:gut")})
+                inputs={"AMT": ([0.0], [4.0], "dose:gut"), "heat": ([0.0, 2.0], [1.0, 2.0])})
     _print_data(FitArguments(), load("spring"), data, {})
     assert "4 rows of x; 1 values missing" in capsys.readouterr().out
     panel = Data([[0.0, 1.0], [0.0, 1.0]], [[[np.nan], [1.0]], [[np.nan], [2.0]]], ("x",), series=("a", "b"),
