@@ -27,12 +27,13 @@ from lfm_ppl.cli.requested_times import requested_times
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
 from lfm_ppl.io.data_set import Data, at_origin, in_unit
+from lfm_ppl.io.dosing import ROLES
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.results import arviz_data, files, html_report, inputs, plots, tables
 from lfm_ppl.results.plots.trajectories import trajectory_names
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, MEAN, held_out_data, summary
 from lfm_ppl.results.series import select_series, series_dimension, series_labels
-from lfm_ppl.utils import atomic_files, calendar_time
+from lfm_ppl.utils import atomic_files, calendar_time, checks
 
 TABLE = "forecast.csv"
 FIGURE = "forecast.png"
@@ -105,6 +106,9 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
                              "out.")
     model = dataclasses.replace(task.file, outputs=observed.outputs, inputs=interpolations)
     columns = choices.inputs(options.columns, model) if interpolations else {}
+    for name, (_, way) in columns.items():
+        if name not in interpolations and way not in ROLES:
+            raise ValueError(checks.unknown("known input of the result", name, interpolations))
     unit = observed.units.get("time", "")
     time_unit = options.time_unit or arviz_data.attributes(task.posterior).get(TIME_UNIT)
     read = data.read_csv(path, output_columns(options.columns, model), options.columns.time_column,

@@ -21,8 +21,18 @@ INTERPOLATIONS = ("previous", "linear", "zero")
 DOSE = "dose:"
 """Beginning of ``dose:STATE,STATE``, which reads a known input as doses to states."""
 
+ONCE = ":once"
+"""End of ``dose:STATE:once``: the column repeats one dose, which is given at the first time."""
+
 OF_SERIES = " of series "
 """Between the name of a known input and the label of its series in a panel."""
+
+
+def dosed_states(interpolation: str) -> tuple[str, ...]:
+    """Return the states in ``dose:STATE,STATE``; none of another interpolation."""
+    if not interpolation.startswith(DOSE):
+        return ()
+    return tuple(interpolation.removeprefix(DOSE).removesuffix(ONCE).split(","))
 
 
 class InputTable(NamedTuple):
@@ -52,7 +62,7 @@ class InputTable(NamedTuple):
     @property
     def dosed_states(self) -> tuple[str, ...]:
         """Names of the states that receive the values as doses; empty for a function of time."""
-        return tuple(self.interpolation.removeprefix(DOSE).split(",")) if self.is_dose else ()
+        return dosed_states(self.interpolation)
 
     def on_clock(self, ratio: float, shift: float) -> InputTable:
         """Return the table with times ``ratio * t + shift``."""

@@ -18,16 +18,13 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from lfm_ppl.io.data_set import DOSE, InputTable
+from lfm_ppl.io.data_set import DOSE, ONCE, InputTable
 from lfm_ppl.io.missing_codes import warn_of_codes
 from lfm_ppl.io.table import Table, is_missing
 from lfm_ppl.utils import checks
 
 ROLES = ("EVID", "MDV", "ADDL", "II", "CMT", "RATE", "DUR", "SS")
 """Names of the columns that describe events."""
-
-ONCE = ":once"
-"""End of ``dose:STATE:once``: the column repeats one dose, which is given at the first time."""
 
 _FEWEST_REPEATED = 3
 """Number of rows from which equal doses in all of them are suspect."""

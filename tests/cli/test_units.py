@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,18 @@ def test_held_out_dates_are_counted_from_the_origin_of_the_fit(write):
     for dates in (["2026-01-07", "2026-01-07T12:00"], ["2026010700", "2026010712"]):
         read = _held_out_data(write(table(dates)), ForecastOptions(columns=Columns(time_column="time")), task)
         np.testing.assert_allclose(read.times, [48.0, 60.0])
+
+
+def test_held_out_doses_to_several_states_have_the_name_of_the_fit(write):
+    observed = Data(HOURS, np.zeros((3, 1)), ("concentration",), {"time": "h"},
+                    inputs={"dose": ([0.0], [4.0], "dose:gut,central")})
+    task = dataclasses.replace(fitted(None), observed=observed, file=load("pharmacokinetics"))
+    path = write("time,concentration,AMT,CMT\n48,.,7,2\n60,1,.,.\n")
+    for events in ("AMT:gut,central", "AMT:gut,other"):
+        read = _held_out_data(path, ForecastOptions(columns=Columns(events=events)), task)
+        assert read.inputs["dose"].compartments.tolist() == [1]
+    with pytest.raises(ValueError, match="unknown known input of the result 'AMT'.*Known: dose"):
+        _held_out_data(path, ForecastOptions(columns=Columns(events="AMT:liver,gut")), task)
 
 
 def test_rows_of_doses_are_no_missing_values(capsys):

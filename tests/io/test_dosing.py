@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 
 import jax.numpy as jnp
@@ -189,3 +190,19 @@ def test_the_command_line_names_states_and_roles():
     assert choices.inputs(Columns(events="AMT:gut,blood,where:CMT"), model) == {
         "dose": ("AMT", "dose:gut,blood"), "where": ("where", "CMT")}
     assert choices.inputs(Columns(events="dose:gut:once"), model) == {"dose": ("dose", "dose:gut:once")}
+    stored = dataclasses.replace(model, inputs={"dose": "dose:gut,blood", "AMT": "dose:liver"})
+    assert choices.inputs(Columns(events="AMT:gut,blood"), stored) == {"dose": ("AMT", "dose:gut,blood")}
+    assert choices.inputs(Columns(events="D:gut , where:cmt"), stored) == {
+        "dose": ("D", "dose:gut"), "where": ("where", "CMT")}
+    assert choices.inputs(Columns(events="D:gut,blood:once"), stored) == {"dose": ("D", "dose:gut,blood:once")}
+    assert choices.inputs(Columns(events="D:liver,gut"), stored) == {"AMT": ("D", "dose:liver,gut")}
+
+
+@pytest.mark.parametrize(("events", "words"), [
+    ("AMT:gut:once,blood", "'blood' after the other states"), ("AMT:gut,where:CMT,blood", "'blood' after the other"),
+    ("AMT:gut,a:CMT,b:cmt", "two columns for CMT: a and b"), ("AMT:gut,AMT:blood", "column AMT twice"),
+    ("AMT:gut:twice", "COLUMN:STATE"), ("AMT:", "COLUMN:STATE"), ("AMT", "COLUMN:STATE"),
+])
+def test_mistakes_in_events_are_one_line(events, words):
+    with pytest.raises(ValueError, match=words):
+        choices.inputs(Columns(events=events), load("pharmacokinetics"))
