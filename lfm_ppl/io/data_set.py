@@ -71,39 +71,70 @@ class InputTable(NamedTuple):
                              resets=None if self.resets is None else self.resets * ratio + shift)
 
     def continued(self, later: InputTable) -> InputTable:
-        """Return the table up to the first time of a later one, followed by it."""
-        first = later.times.min(initial=np.inf)
-        if later.resets is not None:
-            first = min(first, later.resets.min(initial=np.inf))
-        is_earlier = self.times < first
+        """Return the table up to the first time of a later one, followed by it.
 
-        def join(mine: np.ndarray | None, theirs: np.ndarray | None) -> np.ndarray | None:
-            """Return an array of both tables; None where neither has it, zeros where one has none."""
-            if mine is None and theirs is None:
-                return None
-            mine = np.zeros(len(self.times), int) if mine is None else mine
-            return np.append(mine[is_earlier], np.zeros(len(later.times), int) if theirs is None else theirs)
+        A reset in the later table ends the infusions that run. States that only the later table names are added.
 
-        resets = self.resets
-        if later.resets is not None:
-            resets = later.resets if resets is None else np.append(resets[resets < first], later.resets)
-        return InputTable(np.append(self.times[is_earlier], later.times),
-                          np.append(self.values[is_earlier], later.values), self.interpolation,
-                          join(self.durations, later.durations), join(self.compartments, later.compartments), resets)
+        Raises:
+            ValueError: one of the tables holds doses, the other one a function of time.
+        """
+        if self.is_dose != later.is_dose:
+            kinds = [f"doses to {', '.join(table.dosed_states)}" if table.is_dose else "a function of time"
+                     for table in (self, later)]
+            raise ValueError(f"the known input is {kinds[0]} in the fit and {kinds[1]} in the later data; read it in "
+                             "one manner.")
+        later_resets = np.zeros(0) if later.resets is None else later.resets
+        end = min(later.times.min(initial=np.inf), later_resets.min(initial=np.inf))
+        is_earlier = self.times < end
+        times, values = self.times[is_earlier], self.values[is_earlier]
+        if not self.is_dose:
+            return InputTable(np.append(times, later.times), np.append(values, later.values), self.interpolation)
+        durations, later_durations = self.durations_of_all[is_earlier], later.durations_of_all
+        values, durations = end_at_resets(times, values, durations, later_resets)
+        states = list(dict.fromkeys((*self.dosed_states, *later.dosed_states)))
+        index = np.array([states.index(state) for state in later.dosed_states])
+        compartments = np.append(self.compartments_of_all[is_earlier], index[later.compartments_of_all])
+        durations = np.append(durations, later_durations)
+        resets = later_resets if self.resets is None else np.append(self.resets[self.resets < end], later_resets)
+        return InputTable(np.append(times, later.times), np.append(values, later.values), DOSE + ",".join(states),
+                          durations if durations.any() else None, compartments if len(states) > 1 else None,
+                          resets if resets.size else None)
+
+    @property
+    def durations_of_all(self) -> np.ndarray:
+        """Lengths (K,) of the infusions, zero for doses at once."""
+        return np.zeros(len(self.times)) if self.durations is None else self.durations
+
+    @property
+    def compartments_of_all(self) -> np.ndarray:
+        """Indices (K,) of the states that receive the doses."""
+        return np.zeros(len(self.times), int) if self.compartments is None else self.compartments
 
     def event_arrays(self) -> dict[tuple[str, str], tuple[np.ndarray, ...]]:
         """Return the arrays of the doses as events: kind and state -> times, values and durations."""
         arrays: dict[tuple[str, str], tuple[np.ndarray, ...]] = {}
         if self.resets is not None and len(self.resets):
             arrays["reset", ""] = self.resets, np.zeros(len(self.resets)), np.zeros(len(self.resets))
-        durations = np.zeros(len(self.times)) if self.durations is None else self.durations
-        compartments = np.zeros(len(self.times), int) if self.compartments is None else self.compartments
+        durations, compartments = self.durations_of_all, self.compartments_of_all
         for index, state in enumerate(self.dosed_states):
             for kind, is_kind in (("dose", durations == 0), ("infusion", durations > 0)):
                 rows = is_kind & (compartments == index)
                 if rows.any():
                     arrays[kind, state] = self.times[rows], self.values[rows], durations[rows]
         return arrays or {("dose", self.dosed_states[0]): (self.times, self.values, durations)}
+
+
+def end_at_resets(times: np.ndarray, values: np.ndarray, durations: np.ndarray,
+                  resets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return amounts (K,) and durations (K,) of doses whose infusions end at the next reset after their start.
+
+    The rate of an infusion stays, and a dose at once (duration zero) is unchanged. ``resets`` (R,) are sorted.
+    """
+    next_reset = np.append(resets, np.inf)[np.searchsorted(resets, times, side="right")]
+    shortened = np.minimum(durations, next_reset - times)
+    is_ended = shortened < durations
+    fraction = np.where(is_ended, shortened, 1.0) / np.where(is_ended, durations, 1.0)
+    return values * fraction, shortened
 
 
 @dataclass(frozen=True)

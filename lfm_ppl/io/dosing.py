@@ -18,7 +18,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from lfm_ppl.io.data_set import DOSE, ONCE, InputTable
+from lfm_ppl.io.data_set import DOSE, ONCE, InputTable, end_at_resets
 from lfm_ppl.io.missing_codes import warn_of_codes
 from lfm_ppl.io.table import Table, is_missing
 from lfm_ppl.utils import checks
@@ -162,12 +162,7 @@ def _doses_of_column(table: Table, name: str, way: str, times: np.ndarray, colum
     order = np.argsort(dose_times, kind="stable")
     source, dose_times, compartment = source[order], dose_times[order], np.repeat(compartment, count)[order]
     values, durations = amounts[source], duration[source]
-    if resets.size:
-        # A reset ends the infusions that run.
-        reset_after = np.append(resets, np.inf)[np.searchsorted(resets, dose_times, side="right")]
-        shortened = np.minimum(durations, reset_after - dose_times)
-        values = np.where(durations > 0, values * shortened / np.where(durations > 0, durations, 1.0), values)
-        durations = shortened * (durations > 0)
+    values, durations = end_at_resets(dose_times, values, durations, resets)
     return InputTable(dose_times, values, way, durations if durations.any() else None,
                       compartment if len(states) > 1 else None)
 
