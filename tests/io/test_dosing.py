@@ -134,7 +134,7 @@ def test_resets_come_before_doses_and_end_infusions(read):
     ("AMT,EVID\n3,2", "EVID 2 with a dose"), ("AMT,EVID\n3,0", "no dose"), ("AMT,EVID\n.,1", "no amount"),
     ("AMT,EVID\n3,7", "EVID must be"), ("AMT\n-3", "negative"), ("AMT,CMT\n3,3", "compartment 3"),
     ("AMT,CMT\n3,liver", "compartment liver"), ("AMT,ADDL\n3,2", "in II"),
-    ("AMT,ADDL,II\n3,1.5,2", "number of further"),
+    ("AMT,ADDL,II\n3,1.5,2", "number of additional"),
     ("AMT,RATE,DUR\n3,1,1", "leave one"), ("AMT,DUR\n3,-1", "duration"), ("AMT,rate\n3,-7", "above zero"),
 ])
 def test_rows_that_are_not_read_are_named(cells, message, read):
@@ -172,6 +172,112 @@ def test_series_of_a_panel_have_infusions_and_resets_of_their_own(tmp_path):
     reset, dose, infusion = panel.doses()
     assert reset.times[0].tolist() == [6.0] and infusion.values.tolist() == [[8.0], [0.0]]
     assert dose.values.tolist() == [[0.0], [4.0]] and dose.times[1].tolist() == [1.0]
+
+
+@pytest.mark.parametrize(("text", "outputs"), [
+    ("TIME,DV,AMT,EVID,CMT\n0,.,4,1,1\n1,2,.,0,1\n1,7,.,0,2\n2,3,.,0,1\n", ["DV"]),
+    ("TIME,DV,AMT,cmt\n0,.,4,1\n1,2,.,1\n2,7,.,2.0\n", ["DV"]),
+    ("TIME,DV,AMT,EVID,DVID\n0,.,4,1,0\n1,2,.,0,1\n1,7,.,0,2\n", ["DV"]),
+    ("TIME,DV,OTHER,AMT,dvid\n0,.,.,4,0\n1,2,.,.,conc\n1,7,1,.,effect\n", ["DV", "OTHER"]),
+])
+def test_outputs_that_share_a_column_are_refused(tmp_path, text, outputs):
+    path = tmp_path / "pk.csv"
+    path.write_text(text)
+    for inputs in ({"AMT": "dose:gut,blood"}, {}):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that no dose is read
+            with pytest.raises(ValueError, match="give each output a column|series"):
+                read_csv(path, outputs, inputs=inputs)
+    path.write_text("TIME,DV,AMT,EVID,DVID,CMT\n0,.,4,1,0,1\n1,2,.,0,1,2\n1,7,.,0,1,2.0\n2,3,.,2,3,1\n")
+    assert np.isfinite(read_csv(path, ["DV"], inputs={"AMT": "dose:gut,blood"}).y).sum() == 2
+
+
+def test_columns_that_tell_rows_of_doses_apart_identify_no_series(tmp_path):
+    path = tmp_path / "pk.csv"
+    rows = "".join(f"{time},.,4,1,dose\n{time},2,.,0,sample\n" for time in range(4))
+    path.write_text("TIME,DV,AMT,EVID,kind\n" + rows)
+    assert len(read_csv(path, ["DV"], inputs={"AMT": "dose:gut"}).times) == 8
+    path.write_text("TIME,DV,AMT,EVID,ID\n0,.,4,1,\n" + "".join(f"{t},2,.,0,{1 + t % 2}\n" for t in range(1, 5)))
+    with pytest.raises(ValueError, match="--series ID"):
+        read_csv(path, ["DV"], inputs={"AMT": "dose:gut"})
+
+
+@pytest.mark.parametrize(("names", "cells", "column"), [
+    ("EVID,AMT", "1,4", "EVID"), ("evid,amt", "4,4", "evid"), ("EVID,AMT", "3,.", "EVID"), ("ADDL,dose", "2,4", "ADDL"),
+    ("SS,AMT", "1,4", "SS"),
+])
+def test_doses_that_are_not_read_are_a_warning(tmp_path, names, cells, column):
+    path = tmp_path / "pk.csv"
+    path.write_text(f"TIME,DV,{names}\n0,.,{cells}\n1,2,.,.\n")
+    with pytest.warns(UserWarning, match=f"{column!r}: the file marks doses.*--events {names.split(',')[1]}:STATE"):
+        read_csv(path, ["DV"])
+
+
+def test_intervals_and_rates_beside_dates_need_a_unit(tmp_path):
+    path = tmp_path / "pk.csv"
+    for name, cells in (("II", "12,1"), ("DUR", "2,."), ("RATE", "2,.")):
+        path.write_text(f"date,DV,AMT,{name},ADDL\n2026-01-05,.,4,{cells}\n2026-01-06,1,.,.,.\n")
+        with pytest.raises(ValueError, match=f"row 2, column '{name}'.*unit of time of {name} is not known.*--time-unit"):
+            read_csv(path, ["DV"], inputs={"AMT": "dose:gut"})
+        for unit, scale in ((None, 1.0), ("d", 24.0)):
+            table = read_csv(path, ["DV"], inputs={"AMT": "dose:gut"}, time_unit=unit, usual_unit="h").inputs["AMT"]
+            table = table.on_clock(scale, 0.0)
+            time = table.times[1] if name == "II" else table.durations[0]
+            assert time == (12.0 if name == "II" else 2.0) * scale
+
+
+def test_outputs_of_rows_with_an_amount(read, recwarn):
+    for column in ("CMT,1", "ADDL,.", "RATE,."):
+        name, cell = column.split(",")
+        data = read(f"TIME,DV,AMT,{name}\n0,0,4,{cell}\n1,2,.,.\n")
+        np.testing.assert_array_equal(data.y[:, 0], [np.nan, 2.0])
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match="'DV': the output is 0 in all rows with a dose"):
+        data = read("TIME,DV,AMT\n0,0,4\n1,2,.\n2,0,4\n3,0,.\n")
+    assert data.y[:, 0].tolist() == [0.0, 2.0, 0.0, 0.0]
+    read("TIME,DV,AMT\n0,0,4\n1,2,.\n2,1.5,4\n")
+    assert len(recwarn.list) == 0
+
+
+def test_identifiers_and_columns_of_events_are_no_outputs(tmp_path):
+    path = tmp_path / "pk.csv"
+    path.write_text("SubjectID,time,conc,dose,CMT,where\n1,0,.,4,9,2\n1,1,2,.,.,.\n")
+    data = read_csv(path, inputs={"dose": "dose:gut,blood", "where": "cmt"})
+    assert data.outputs == ("conc",) and data.doses()[0].state == "blood"
+    assert read_csv(path).outputs == ("SubjectID", "conc", "dose", "CMT", "where")
+    with pytest.raises(ValueError, match=r"unknown column of CMT 'were'\. Did you mean 'where'"):
+        read_csv(path, ["conc"], inputs={"dose": "dose:gut,blood", "were": "CMT"})
+    with pytest.raises(ValueError, match="'where' and 'SubjectID' are both given the role CMT"):
+        read_csv(path, ["conc"], inputs={"dose": "dose:gut", "where": "CMT", "SubjectID": "cmt"})
+    with pytest.raises(ValueError, match=r"'amount'.*--events COLUMN:gut,blood \(inputs="):
+        read_csv(path, ["conc"], inputs={"amount": "dose:gut,blood"})
+
+
+def test_the_remedy_of_repeated_doses_to_several_states_is_an_option(tmp_path):
+    path = tmp_path / "theoph.csv"
+    path.write_text(REPEATED)
+    with pytest.warns(UserWarning, match="--events dose:gut,blood:once"):
+        read_csv(path, ["conc"], inputs={"dose": "dose:gut,blood"})
+    (name, way), = choices.inputs(Columns(events="dose:gut,blood:once"), load("pharmacokinetics")).values()
+    assert read_csv(path, ["conc"], inputs={name: way}).inputs["dose"].values.tolist() == [320.0]
+
+
+def test_a_bolus_and_an_infusion_at_one_time(read):
+    data = read("TIME,DV,AMT,RATE\n0,.,4,.\n0,.,6,3\n0,.,8,1\n1,2,.,.\n", "dose:gut")
+    dose, infusion = data.doses()
+    assert dose.values.tolist() == [4.0] and infusion.durations.tolist() == [2.0, 8.0]
+    with pytest.raises(ValueError, match="row 4.*their sum"):
+        read("TIME,DV,AMT,RATE\n0,.,4,.\n0,.,6,3\n0,.,5,.\n1,2,.,.\n", "dose:gut")
+
+
+def test_names_of_measurements_are_no_infusions(tmp_path):
+    path = tmp_path / "pk.csv"
+    for name in ("rate", "dur", "Rate", "ii", "ss"):
+        path.write_text(f"time,conc,dose,{name}\n0,.,4,72\n1,2,.,70\n")
+        data = read_csv(path, inputs={"dose": "dose:gut"})
+        assert data.outputs == ("conc", name) and data.inputs["dose"].durations is None
+    path.write_text("time,conc,dose,rate,cmt\n0,.,4,2,1\n1,2,.,.,.\n")
+    assert read_csv(path, inputs={"dose": "dose:gut"}).inputs["dose"].durations.tolist() == [2.0]
 
 
 def test_later_doses_continue_the_earlier_ones(read):
