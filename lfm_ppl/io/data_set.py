@@ -228,6 +228,9 @@ def _input_table(name: str, value: Any, origin: str | None, unit: str) -> InputT
         raise TypeError(f"the known input {name!r} must be (times, values), (times, values, interpolation) or an "
                         f"lfm.Input, got {type(value).__name__}.")
     times, values, interpolation = (*value, "previous")[:3]
+    if interpolation.startswith(DOSE) and interpolation.endswith(ONCE):
+        raise ValueError(f"the known input {name!r}: {interpolation!r} is for a column of a file that repeats a dose; "
+                         f"give the dose once, ([time], [amount], {interpolation.removesuffix(ONCE)!r}).")
     label = f"times of the known input {name!r}"
     checks.refuse_durations(label, times)
     times = calendar_time.positions(label, times, origin, unit)
@@ -238,6 +241,10 @@ def _input_table(name: str, value: Any, origin: str | None, unit: str) -> InputT
         remedy = f"{name!r}: (times, values, 'zero')"
         values = fill_blanks(f"the known input {name!r}", remedy, times, values, interpolation)
         times, values = times[~np.isnan(values)], values[~np.isnan(values)]
+    if interpolation.startswith(DOSE) and (values < 0).any():
+        index = int(np.argmax(values < 0))
+        raise ValueError(f"the known input {name!r}: the dose {values[index]:g} at index {index} is negative; give "
+                         "amounts of zero or more.")
     return InputTable(times, values, "previous" if interpolation == "zero" else interpolation)
 
 

@@ -338,3 +338,13 @@ def test_the_command_line_names_states_and_roles():
 def test_mistakes_in_events_are_one_line(events, words):
     with pytest.raises(ValueError, match=words):
         choices.inputs(Columns(events=events), load("pharmacokinetics"))
+
+
+@pytest.mark.parametrize(("value", "words"), [
+    (([0.0], [4.0], "dose:gut:once"), "'AMT': 'dose:gut:once' is for a column of a file.*'dose:gut'"),
+    (([0.0, 1.0], [4.0, -1.0], "dose:gut"), "'AMT': the dose -1 at index 1 is negative"),
+    (([0.0, 1.0, 2.0], [4.0, np.nan, -2.0], "dose:gut,blood"), "the dose -2 at index"),
+])
+def test_doses_in_memory_that_are_not_read(value, words):
+    with pytest.raises(ValueError, match=words):
+        Data([0.0], [[1.0]], ("DV",), inputs={"AMT": value})
