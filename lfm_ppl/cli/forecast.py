@@ -20,7 +20,7 @@ import pandas as pd
 
 import lfm_ppl
 from lfm_ppl.cli import choices, page, results, session
-from lfm_ppl.cli.data_file import output_columns
+from lfm_ppl.cli.data_file import column_unit, output_columns
 from lfm_ppl.cli.fit_arguments import TIME_UNIT
 from lfm_ppl.cli.options import ForecastOptions, Times
 from lfm_ppl.cli.requested_times import requested_times
@@ -110,7 +110,9 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
         if name not in interpolations and way not in ROLES:
             raise ValueError(checks.unknown("known input of the result", name, interpolations))
     unit = observed.units.get("time", "")
-    time_unit = options.time_unit or arviz_data.attributes(task.posterior).get(TIME_UNIT)
+    time_unit = options.time_unit
+    if time_unit is None and column_unit(path, options.columns.time_column) is None:
+        time_unit = arviz_data.attributes(task.posterior).get(TIME_UNIT)
     read = data.read_csv(path, output_columns(options.columns, model), options.columns.time_column,
                          dict(columns.values()), time_unit or (unit if observed.origin is not None else None),
                          observed=not columns)
