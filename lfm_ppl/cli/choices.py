@@ -88,7 +88,8 @@ def _doses(text: str | None, doses: Mapping[str, str]) -> dict[str, tuple[str, s
     for column, states in _event_columns(text).items():
         if (role := states.upper()) in ROLES:
             if role in roles:
-                raise ValueError(f"--events names two columns for {role}: {roles[role]} and {column}. Name one of them.")
+                raise ValueError(f"--events names two columns for {role}: {roles[role]} and {column}. Name one of "
+                                 "them.")
             roles[role] = column
             columns[column] = (column, role)
             continue
@@ -110,8 +111,9 @@ def _event_columns(text: str) -> dict[str, str]:
     for part in text.split(","):
         words = [word.strip() for word in part.split(":")]
         # A state after the first one of its column, the last of them with or without ":once".
-        is_state = column and (len(words) == 1 or len(words) == 2 and words[1] == ONCE.removeprefix(":"))
-        if not all(words) or not is_state and not (len(words) == 2 or len(words) == 3 and words[2] == ONCE.removeprefix(":")):
+        is_once = len(words) > 1 and words[-1] == ONCE.removeprefix(":")
+        is_state = bool(column) and len(words) == 1 + is_once
+        if not all(words) or not is_state and len(words) != 2 and not (len(words) == 3 and is_once):
             raise ValueError(f"--events takes COLUMN:STATE, the column of the doses and the state that receives them, "
                              f"got {part!r}.")
         if is_state:
@@ -128,16 +130,17 @@ def _event_columns(text: str) -> dict[str, str]:
     return columns
 
 
-def _functions(columns_text: str | None, model: ModelFile, ways: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+def _functions(columns_text: str | None, model: ModelFile,
+               interpolations: Mapping[str, str]) -> dict[str, tuple[str, str]]:
     if columns_text is None:
-        return {name: (name, way) for name, way in ways.items()}
+        return {name: (name, way) for name, way in interpolations.items()}
     columns = [tuple(part.strip() for part in text.partition(":")[::2]) for text in columns_text.split(",")]
-    names = list(ways) or [column for column, _ in columns]
+    names = list(interpolations) or [column for column, _ in columns]
     if len(names) != len(columns) or len(set(columns)) < len(columns):
         raise ValueError(f"{model.name} takes {checks.counted(len(names), 'known input')} ({', '.join(names)}); "
                          f"--inputs names {checks.counted(len(columns), 'column')}, which must be as many, each of "
                          "them once.")
-    return {name: (column, way or ways.get(name, "previous"))
+    return {name: (column, way or interpolations.get(name, "previous"))
             for name, (column, way) in zip(names, columns, strict=True)}
 
 

@@ -7,8 +7,8 @@
    every row with an amount is a dose.
 3. The output of a row is not observed where EVID or MDV is not 0. Without them a row with an amount is not observed
    where the file has CMT, ADDL, II or RATE.
-4. ADDL is the number of additional doses, at distances of II, in the unit of the times. RATE or DUR make an infusion of a dose, which ends at a
-   reset. CMT is the number of the state, in the order given, or its name.
+4. ADDL is the number of additional doses, at distances of II, in the unit of the times. RATE or DUR make an infusion of
+   a dose, which ends at a reset. CMT is the number of the state, in the order given, or its name.
 5. What has no meaning here, or another one, is refused: SS, a RATE of -1 or -2, EVID 2 with a dose.
 
 Source: Beal, Sheiner, Boeckmann and Bauer (2009), NONMEM User's Guides, part VI, chapter V.
@@ -39,7 +39,7 @@ _FEWEST_REPEATED = 3
 def event_columns(table: Table, interpolations: Mapping[str, str], outputs: Collection[str]) -> dict[str, str]:
     """Return the columns that describe events: role -> column.
 
-    Names such as rate, in lower case, may be those of measurements: they have a role beside another column of dosing.
+    A column such as rate, in lower case, may be a measurement. It has a role only beside another column of dosing.
 
     Args:
         table: the data.
@@ -97,18 +97,22 @@ def check_outputs(table: Table, columns: Mapping[str, str], names: Sequence[str]
         is_dosed: (T,), rows with an amount, whose CMT is that of the dose.
         used: columns that are outputs or inputs.
     """
-    for column in (columns.get("CMT"), next((name for name in table.frame if name.upper() == "DVID"), None)):
-        for name, values in zip(names, y.T, strict=True) if column is not None and column not in used else ():
+    labelling = [name for name in table.frame if name == columns.get("CMT") or name.upper() == "DVID"]
+    for column in (name for name in labelling if name not in used):
+        for name, values in zip(names, y.T, strict=True):
             cells = table.frame[column]
-            rows = [row for row in np.flatnonzero(np.isfinite(values) & ~is_dosed) if not is_missing(cells.iloc[row])]
+            rows = [row for row in np.flatnonzero(np.isfinite(values) & ~is_dosed).tolist()
+                    if not is_missing(cells.iloc[row])]
             labels = [_label(cells.iloc[row]) for row in rows]
             if len(set(labels)) > 1:
                 row = next(row for row, label in zip(rows, labels, strict=True) if label != labels[0])
                 raise ValueError(f"{table.location(row, column)}: the column has {len(set(labels))} values in rows "
                                  f"with an observation of {name}, so that it tells outputs apart; give each output a "
                                  "column, with blank cells in the rows of the others.")
-    for name, values in () if {"EVID", "MDV"} & set(columns) else zip(names, y.T, strict=True):
-        if is_dosed.any() and not is_dosed.all() and (values[is_dosed] == 0).all():
+    if {"EVID", "MDV"} & set(columns) or is_dosed.all() or not is_dosed.any():
+        return
+    for name, values in zip(names, y.T, strict=True):
+        if (values[is_dosed] == 0).all():
             checks.warn(f"{table.label}, column {name!r}: the output is 0 in all rows with a dose. If it was not "
                         "measured there, leave the cells blank, or write MDV 1 in these rows.")
 

@@ -43,7 +43,7 @@ def random_file(seed):
         cells = dict.fromkeys(HEADER.split(","), ".") | {"TIME": time, "EVID": 0, "MDV": 0, "DV": 1.0}
         if kind in ("dose", "reset"):
             state, amount = generator.integers(2), float(generator.integers(20, 100))
-            duration, further, gap = 0.0, int(generator.integers(3)), 7.25
+            duration, additional, gap = 0.0, int(generator.integers(3)), 7.25
             compartment = generator.choice([str(state + 1), ["gut", "blood"][state]])
             cells |= {"EVID": 1, "MDV": 1, "AMT": amount, "CMT": compartment}
             if kind == "reset":
@@ -52,12 +52,12 @@ def random_file(seed):
             if generator.random() < 0.5:
                 duration = float(generator.choice([0.75, 4.0, 10.0]))
                 cells |= {"RATE": repr(amount / duration)} if generator.random() < 0.5 else {"dur": duration}
-            if further:
-                cells |= {"ADDL": further, "II": gap}
-            doses += [(time + k * gap, amount, state, duration) for k in range(further + 1)]
+            if additional:
+                cells |= {"ADDL": additional, "II": gap}
+            doses += [(time + k * gap, amount, state, duration) for k in range(additional + 1)]
             if kind == "reset" and generator.random() < 0.5:
                 cells |= dict.fromkeys(("AMT", "CMT", "RATE", "dur", "ADDL", "II"), ".") | {"EVID": 3}
-                del doses[-further - 1:]
+                del doses[-additional - 1:]
         elif kind == "other":
             cells |= {"EVID": generator.choice([0, 2]), "MDV": 1, "DV": 99.0}
         rows.append(",".join(str(cells[name]) for name in HEADER.split(",")))
@@ -104,8 +104,8 @@ def test_a_dosing_file_is_the_history_that_it_describes(seed, read):
     np.testing.assert_allclose(predicted(data), simulate(data.times, doses, resets), atol=1e-8)
     # Stored with a result, and read back.
     stored = inputs_of(build({GROUP: to_dataset(data.inputs)}))["AMT"]
-    for mine, theirs in zip(stored, data.inputs["AMT"], strict=True):
-        np.testing.assert_array_equal(mine, theirs)
+    for loaded, original in zip(stored, data.inputs["AMT"], strict=True):
+        np.testing.assert_array_equal(loaded, original)
 
 
 def test_rows_without_evid_are_doses_where_they_have_an_amount(read):
@@ -217,7 +217,7 @@ def test_intervals_and_rates_beside_dates_need_a_unit(tmp_path):
     path = tmp_path / "pk.csv"
     for name, cells in (("II", "12,1"), ("DUR", "2,."), ("RATE", "2,.")):
         path.write_text(f"date,DV,AMT,{name},ADDL\n2026-01-05,.,4,{cells}\n2026-01-06,1,.,.,.\n")
-        with pytest.raises(ValueError, match=f"row 2, column '{name}'.*unit of time of {name} is not known.*--time-unit"):
+        with pytest.raises(ValueError, match=f"row 2, column '{name}'.*unit of time of {name} is.*--time-unit"):
             read_csv(path, ["DV"], inputs={"AMT": "dose:gut"})
         for unit, scale in ((None, 1.0), ("d", 24.0)):
             table = read_csv(path, ["DV"], inputs={"AMT": "dose:gut"}, time_unit=unit, usual_unit="h").inputs["AMT"]
