@@ -26,7 +26,7 @@ from lfm_ppl.cli.options import ForecastOptions, Times
 from lfm_ppl.cli.requested_times import requested_times
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
-from lfm_ppl.io.data_set import Data, at_origin, in_unit
+from lfm_ppl.io.data_set import Data, at_origin, continued_inputs, in_unit
 from lfm_ppl.io.dosing import ROLES
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.results import arviz_data, files, html_report, inputs, plots, tables
@@ -78,8 +78,8 @@ def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) 
     known_inputs = {}
     if held_out is not None:
         times = np.union1d(times, held_out.times)
-        known_inputs = {name: table if table.is_dose else Input(*table[:3]) for name, table in (
-            (name, task.observed.inputs[name].continued(later)) for name, later in held_out.inputs.items())}
+        known_inputs = {name: table if table.is_dose else Input(*table[:3])
+                        for name, table in continued_inputs(task.observed.inputs, held_out.inputs).items()}
     keywords: dict[str, Any] = {"inputs": known_inputs, "model_kwargs": task.keywords}
     forecast = lfm_ppl.forecast(task.posterior, task.model, times, draws=options.draws, seed=options.seed,
                                 progress=not options.quiet, **keywords)
@@ -128,8 +128,7 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
     if repeated_rows := int(np.isin(read.times, observed.times).sum()):
         print(f"note     {repeated_rows} of {len(read.times)} rows of {path} are at times of the fitted data: if they "
               "are the same data, their scores are not scores of a forecast")
-    prepared = task.file.prepare(dataclasses.replace(read, inputs={
-        name: observed.inputs[name].continued(later) for name, later in read.inputs.items()}))
+    prepared = task.file.prepare(dataclasses.replace(read, inputs=continued_inputs(observed.inputs, read.inputs)))
     if not np.array_equal(prepared.y, read.y, equal_nan=True):
         raise ValueError(f"{task.file.path} changes the numbers of a data file in `prepare`, so that held-out numbers "
                          "may not be comparable with the fitted ones. Score them in Python, on the model's scale: "

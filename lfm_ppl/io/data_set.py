@@ -70,10 +70,11 @@ class InputTable(NamedTuple):
                              durations=None if self.durations is None else self.durations * ratio,
                              resets=None if self.resets is None else self.resets * ratio + shift)
 
-    def continued(self, later: InputTable) -> InputTable:
+    def continued(self, later: InputTable, later_resets: np.ndarray) -> InputTable:
         """Return the table up to the first time of a later one, followed by it.
 
-        A reset in the later table ends the infusions that run. States that only the later table names are added.
+        The later resets (R,), also of other tables, end the infusions that run. States that only the later table names
+        are added.
 
         Raises:
             ValueError: one of the tables holds doses, the other one a function of time.
@@ -83,8 +84,8 @@ class InputTable(NamedTuple):
                      for table in (self, later)]
             raise ValueError(f"the known input is {kinds[0]} in the fit and {kinds[1]} in the later data; read it in "
                              "one manner.")
-        later_resets = np.zeros(0) if later.resets is None else later.resets
-        end = min(later.times.min(initial=np.inf), later_resets.min(initial=np.inf))
+        earlier_resets, resets = (np.zeros(0) if table.resets is None else table.resets for table in (self, later))
+        end = min(later.times.min(initial=np.inf), resets.min(initial=np.inf))
         is_earlier = self.times < end
         times, values = self.times[is_earlier], self.values[is_earlier]
         if not self.is_dose:
@@ -95,7 +96,7 @@ class InputTable(NamedTuple):
         index = np.array([states.index(state) for state in later.dosed_states])
         compartments = np.append(self.compartments_of_all[is_earlier], index[later.compartments_of_all])
         durations = np.append(durations, later_durations)
-        resets = later_resets if self.resets is None else np.append(self.resets[self.resets < end], later_resets)
+        resets = np.append(earlier_resets[earlier_resets < end], resets)
         return InputTable(np.append(times, later.times), np.append(values, later.values), DOSE + ",".join(states),
                           durations if durations.any() else None, compartments if len(states) > 1 else None,
                           resets if resets.size else None)
@@ -135,6 +136,13 @@ def end_at_resets(times: np.ndarray, values: np.ndarray, durations: np.ndarray,
     is_ended = shortened < durations
     fraction = np.where(is_ended, shortened, 1.0) / np.where(is_ended, durations, 1.0)
     return values * fraction, shortened
+
+
+def continued_inputs(tables: Mapping[str, InputTable], later: Mapping[str, InputTable]) -> dict[str, InputTable]:
+    """Return the tables that a later file continues; its resets, in any table, end the infusions in all of them."""
+    resets = np.sort(np.concatenate([np.zeros(0), *(table.resets for table in later.values()
+                                                    if table.resets is not None)]))
+    return {name: tables[name].continued(table, resets) for name, table in later.items()}
 
 
 @dataclass(frozen=True)

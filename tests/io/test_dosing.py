@@ -14,7 +14,7 @@ import lfm_ppl as lfm
 from lfm_ppl.cli import choices
 from lfm_ppl.cli.options import Columns
 from lfm_ppl.io.data import read_csv, read_series
-from lfm_ppl.io.data_set import Data, InputTable, stack_series
+from lfm_ppl.io.data_set import Data, InputTable, continued_inputs, stack_series
 from lfm_ppl.io.loading import load
 from lfm_ppl.results.arviz_data import build
 from lfm_ppl.results.inputs import GROUP, inputs_of, to_dataset
@@ -280,10 +280,14 @@ def test_names_of_measurements_are_no_infusions(tmp_path):
     assert read_csv(path, inputs={"dose": "dose:gut"}).inputs["dose"].durations.tolist() == [2.0]
 
 
+def continued(earlier, later):
+    return continued_inputs({"AMT": earlier}, {"AMT": later})["AMT"]
+
+
 def test_later_doses_continue_the_earlier_ones(read):
     earlier = read("TIME,DV,AMT,RATE\n0,.,4,2\n6,1,.,.\n").inputs["AMT"]
     later = read("TIME,DV,AMT,CMT\n8,.,3,2\n9,1,.,.\n").inputs["AMT"]
-    joined = earlier.continued(later)
+    joined = continued(earlier, later)
     assert joined.times.tolist() == [0.0, 8.0] and joined.durations.tolist() == [2.0, 0.0]
     assert joined.compartments.tolist() == [0, 1]
     events = Data([0.0], [[1.0]], ("DV",), inputs={"AMT": joined}).doses()
@@ -293,15 +297,15 @@ def test_later_doses_continue_the_earlier_ones(read):
 def test_later_doses_keep_their_states(read):
     earlier = read("TIME,DV,AMT\n0,.,4\n6,1,.\n", "dose:gut").inputs["AMT"]
     later = read("TIME,DV,AMT,CMT\n8,.,3,2\n9,.,5,1\n10,1,.,.\n", "dose:blood,gut").inputs["AMT"]
-    joined = earlier.continued(later)
+    joined = continued(earlier, later)
     assert joined.dosed_states == ("gut", "blood") and joined.compartments.tolist() == [0, 0, 1]
-    (dose,) = Data([0.0], [[1.0]], ("DV",), inputs={"AMT": earlier.continued(earlier.on_clock(1.0, 9.0))}).doses()
+    (dose,) = Data([0.0], [[1.0]], ("DV",), inputs={"AMT": continued(earlier, earlier.on_clock(1.0, 9.0))}).doses()
     assert dose.times.tolist() == [0.0, 9.0]
     blood, _ = Data([0.0], [[1.0]], ("DV",), inputs={
-        "AMT": earlier.continued(InputTable(np.array([9.0]), np.array([2.0]), "dose:blood"))}).doses()
+        "AMT": continued(earlier, InputTable(np.array([9.0]), np.array([2.0]), "dose:blood"))}).doses()
     assert (blood.state, blood.values.tolist()) == ("blood", [2.0])
     with pytest.raises(ValueError, match="doses to gut in the fit and a function of time"):
-        earlier.continued(InputTable(np.array([9.0]), np.array([2.0])))
+        continued(earlier, InputTable(np.array([9.0]), np.array([2.0])))
 
 
 def test_a_later_reset_ends_an_infusion_that_runs(read):
@@ -309,11 +313,14 @@ def test_a_later_reset_ends_an_infusion_that_runs(read):
     earlier = read(text, "dose:gut").inputs["AMT"]
     assert earlier.durations.tolist() == [7.0, 0.0]
     later = read(f"{HEADER}\n5,.,.,3,1,.,.,.,.,.\n6,1,.,0,0,.,.,.,.,.\n", "dose:gut").inputs["AMT"]
-    joined = earlier.continued(later)
+    joined = continued(earlier, later)
     assert joined.durations.tolist() == [5.0, 0.0] and joined.values.tolist() == [20.0, 5.0]
     assert joined.resets.tolist() == [5.0]
     dose = read("TIME,DV,AMT\n6,.,3\n9,1,.\n", "dose:gut").inputs["AMT"]
-    assert earlier.continued(dose).resets is None  # the reset at 7 belongs to the rows that are replaced
+    assert continued(earlier, dose).resets is None  # the reset at 7 belongs to the rows that are replaced
+    other = InputTable(np.array([6.0]), np.array([1.0]), "dose:blood")
+    tables = continued_inputs({"AMT": dose, "iv": earlier}, {"AMT": later, "iv": other})
+    assert tables["iv"].durations.tolist() == [5.0, 0.0, 0.0] and tables["AMT"].resets.tolist() == [5.0]
 
 
 def test_the_command_line_names_states_and_roles():
