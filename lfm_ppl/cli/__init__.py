@@ -52,7 +52,7 @@ def _one_line(error: Exception) -> str:
         return f"{text} (see `{' '.join(['lfm-ppl', *(error.command_chain or ())])} --help`)"
     from lfm_ppl.io import loading
 
-    text, location = text + _remedy(error), loading.place_in_model(error)
+    text, location = text + _remedy(error), loading.location_in_model(error)
     if isinstance(error, KeyError) and location is not None and (names := loading.known_inputs(error)) is not None:
         return (f"{location.file}, line {location.line}: the model reads the known input {text}, and "
                 + (f"has {', '.join(names)}. Correct the name, or add it to INPUTS." if names else
@@ -83,7 +83,7 @@ def _remedy(error: Exception) -> str:
     if unexpected and hasattr(lfm_ppl, unexpected[1]):
         names = list(inspect.signature(getattr(lfm_ppl, unexpected[1])).parameters)
         return f".{checks.nearest(unexpected[2], names)} It takes {', '.join(names)}."
-    if invalid and (location := loading.place_in_model(error)) is not None:
+    if invalid and (location := loading.location_in_model(error)) is not None:
         source = linecache.getline(str(location.file), location.line).strip()
         return f" A {invalid[1]} outside of its range stands in: {source}"
     return ""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from lfm_ppl.cli.options import RULES, Columns
-from lfm_ppl.io.data_set import DOSE
-from lfm_ppl.io.dosing import ONCE, ROLES
+from lfm_ppl.io.data_set import DOSE, ONCE, dosed_states
+from lfm_ppl.io.dosing import ROLES
 from lfm_ppl.io.loading import ModelFile
 from lfm_ppl.utils import checks
 
@@ -77,40 +77,70 @@ def inputs(columns: Columns, model: ModelFile) -> dict[str, tuple[str, str]]:
 
 
 def _doses(text: str | None, doses: Mapping[str, str]) -> dict[str, tuple[str, str]]:
-    """Return the columns of doses, and of what describes them; doses of the model to the same state keep their name."""
+    """Return the columns of doses, and of what describes them; doses of the model to the same states keep their name.
+
+    Where no dose of the model has all these states, the one with the same first state gives the name.
+    """
     if text is None:
         return {name: (name, way) for name, way in doses.items()}
     columns: dict[str, tuple[str, str]] = {}
-    name = ""
-    for part in text.split(","):
-        column, colon, state = (word.strip() for word in part.partition(":"))
-        if name and column and not colon:  # a further state of the column before
-            columns[name] = (columns[name][0], f"{columns[name][1]},{column}")
+    roles: dict[str, str] = {}
+    for column, states in _event_columns(text).items():
+        if (role := states.upper()) in ROLES:
+            if role in roles:
+                raise ValueError(f"--events names two columns for {role}: {roles[role]} and {column}. Name one of "
+                                 "them.")
+            roles[role] = column
+            columns[column] = (column, role)
             continue
-        if not (column and colon and state):
-            raise ValueError(f"--events takes COLUMN:STATE, the column of the doses and the state that receives them, "
-                             f"got {part!r}.")
-        if state in ROLES:
-            columns[column] = (column, state)
-            continue
-        name = next((name for name, way in doses.items() if way == DOSE + state.removesuffix(ONCE)), column)
+        first, _, _ = states.removesuffix(ONCE).partition(",")
+        matches = [name for name, way in doses.items() if way.removesuffix(ONCE) == DOSE + states.removesuffix(ONCE)]
+        matches += [name for name, way in doses.items() if dosed_states(way)[0] == first]
+        name = next(iter(matches), column)
         if name in columns:
-            raise ValueError(f"--events names two columns for the doses {name!r} to {state}: {columns[name][0]} and "
+            raise ValueError(f"--events names two columns for the doses {name!r} to {states}: {columns[name][0]} and "
                              f"{column}. Write them in one column.")
-        columns[name] = (column, DOSE + state)
+        columns[name] = (column, DOSE + states)
     return columns
 
 
-def _functions(columns_text: str | None, model: ModelFile, ways: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+def _event_columns(text: str) -> dict[str, str]:
+    """Return the columns of ``--events``: column -> its states, separated by commas, or its role."""
+    columns: dict[str, str] = {}
+    column = ""
+    for part in text.split(","):
+        words = [word.strip() for word in part.split(":")]
+        # A state after the first one of its column, the last of them with or without ":once".
+        is_once = len(words) > 1 and words[-1] == ONCE.removeprefix(":")
+        is_state = bool(column) and len(words) == 1 + is_once
+        if not all(words) or not is_state and len(words) != 2 and not (len(words) == 3 and is_once):
+            raise ValueError(f"--events takes COLUMN:STATE, the column of the doses and the state that receives them, "
+                             f"got {part!r}.")
+        if is_state:
+            if columns[column].endswith(ONCE) or columns[column].upper() in ROLES:
+                raise ValueError(f"--events {text}: write the state {words[0]!r} after the other states of its column, "
+                                 f"COLUMN:STATE,STATE, and {ONCE!r} after the last of them.")
+            columns[column] += "," + ":".join(words)
+            continue
+        column = words[0]
+        if column in columns:
+            raise ValueError(f"--events names the column {column} twice; write its states in one list, "
+                             f"{column}:STATE,STATE, in the order of a column CMT.")
+        columns[column] = ":".join(words[1:])
+    return columns
+
+
+def _functions(columns_text: str | None, model: ModelFile,
+               interpolations: Mapping[str, str]) -> dict[str, tuple[str, str]]:
     if columns_text is None:
-        return {name: (name, way) for name, way in ways.items()}
+        return {name: (name, way) for name, way in interpolations.items()}
     columns = [tuple(part.strip() for part in text.partition(":")[::2]) for text in columns_text.split(",")]
-    names = list(ways) or [column for column, _ in columns]
+    names = list(interpolations) or [column for column, _ in columns]
     if len(names) != len(columns) or len(set(columns)) < len(columns):
         raise ValueError(f"{model.name} takes {checks.counted(len(names), 'known input')} ({', '.join(names)}); "
                          f"--inputs names {checks.counted(len(columns), 'column')}, which must be as many, each of "
                          "them once.")
-    return {name: (column, way or ways.get(name, "previous"))
+    return {name: (column, way or interpolations.get(name, "previous"))
             for name, (column, way) in zip(names, columns, strict=True)}
 
 

@@ -6,7 +6,8 @@ import dataclasses
 
 from lfm_ppl.cli import choices
 from lfm_ppl.cli.options import Columns, DataOptions
-from lfm_ppl.io import data
+from lfm_ppl.io import data, time_columns
+from lfm_ppl.io import table as tables
 from lfm_ppl.io.data_set import Data, in_unit
 from lfm_ppl.io.loading import ModelFile
 from lfm_ppl.utils import calendar_time, checks
@@ -39,6 +40,21 @@ def output_columns(columns: Columns, model: ModelFile) -> tuple[str, ...] | None
         raise ValueError(f"{model.name} has {checks.counted(len(model.outputs), 'output')} "
                          f"({', '.join(model.outputs)}); --outputs names {checks.counted(len(names), 'column')}.")
     return names
+
+
+def unit_of_file(options: DataOptions) -> str | None:
+    """Return the unit of the times in a file, by --time-unit or the name of the column; None where neither says it."""
+    if options.time_unit is not None:
+        return calendar_time.UNITS[options.time_unit]
+    return None if options.data is None else column_unit(options.data, options.columns.time_column, options.series)
+
+
+def column_unit(path: str, time_column: str | None, series: str | None = None) -> str | None:
+    """Return the unit in the name of the time column of a file, h of ``time_h``; None where it has none."""
+    table = tables.read_file(path)
+    if series is not None:
+        table = tables.Table(table.label, table.frame.drop(columns=series))
+    return time_columns.unit_of(time_columns.find_time_column(table, time_column))
 
 
 def _time_unit(model: ModelFile) -> str | None:

@@ -20,7 +20,7 @@ import numpy as np
 
 import lfm_ppl
 from lfm_ppl.cli import choices, fit_many, page, results, session
-from lfm_ppl.cli.data_file import read_data, read_series
+from lfm_ppl.cli.data_file import read_data, read_series, unit_of_file
 from lfm_ppl.cli.fit_arguments import approximated_model, result_attributes, sampling_arguments, without_data
 from lfm_ppl.cli.options import DataOptions, FitArguments
 from lfm_ppl.cli.requested_times import trajectory_times
@@ -120,7 +120,9 @@ def _inputs_in_words(observed: Data) -> dict[str, str]:
         words[name] = members[0].interpolation
         if members[0].is_dose:
             count = checks.counted(sum(len(table.times) for table in members), "dose")
+            infusions = sum(int((table.durations_of_all > 0).sum()) for table in members)
             words[name] += f", {count} of {sum(float(table.values.sum()) for table in members):g} in all"
+            words[name] += f", {infusions} by infusion" if infusions else ""
     return words
 
 
@@ -145,9 +147,9 @@ def _print_data(options: FitArguments, model: loading.ModelFile, observed: Data,
         print("inputs   " + ", ".join(f"{name} ({way})" for name, way in _inputs_in_words(observed).items()))
     if observed.origin is not None:
         print(f"time     in {observed.units['time']} since {observed.origin.replace('T', ' ')}")
-    elif options.data.time_unit and observed.units.get("time") != calendar_time.UNITS[options.data.time_unit]:
+    elif (unit := unit_of_file(options.data)) and observed.units.get("time", unit) != unit:
         print(f"time     in {observed.units['time']}, the unit of the model, also for --until and --at; converted from "
-              f"{options.data.time_unit} in the file")
+              f"{unit} in the file")
     anchors = model.anchors(observed)
     for name, value in fixed.items():
         is_anchor = name in anchors and anchors[name] == value
@@ -158,7 +160,7 @@ def _rows_of_doses(observed: Data) -> np.ndarray:
     """Return which rows (T,), or (B, T), hold a dose and no measurement; their empty outputs are no missing values."""
     is_dosed = np.zeros(observed.times.shape, bool)
     for name, table in observed.inputs.items():
-        if table.dosed_state:
+        if table.is_dose:
             label = name.partition(OF_SERIES)[2]
             series = observed.series.index(label) if label in observed.series else ...
             is_dosed[series] |= np.isin(observed.times[series], table.times)

@@ -65,7 +65,7 @@ def without_data(keywords: Mapping[str, Any]) -> dict[str, Any]:
 
     `lfm_ppl.fit` takes them from the data, whose times it converts to the unit of the model.
     """
-    return {name: value for name, value in keywords.items() if not (value and name in ("inputs", "events"))}
+    return {name: value for name, value in keywords.items() if not (name in ("inputs", "events") and value)}
 
 
 def result_attributes(options: FitArguments, line: Sequence[str], model: loading.ModelFile, observed: Data,

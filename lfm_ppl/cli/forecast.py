@@ -20,19 +20,20 @@ import pandas as pd
 
 import lfm_ppl
 from lfm_ppl.cli import choices, page, results, session
-from lfm_ppl.cli.data_file import output_columns
+from lfm_ppl.cli.data_file import column_unit, output_columns
 from lfm_ppl.cli.fit_arguments import TIME_UNIT
 from lfm_ppl.cli.options import ForecastOptions, Times
 from lfm_ppl.cli.requested_times import requested_times
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
-from lfm_ppl.io.data_set import Data, at_origin, in_unit
+from lfm_ppl.io.data_set import Data, at_origin, continued_inputs, in_unit
+from lfm_ppl.io.dosing import ROLES
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.results import arviz_data, files, html_report, inputs, plots, tables
 from lfm_ppl.results.plots.trajectories import trajectory_names
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, MEAN, held_out_data, summary
 from lfm_ppl.results.series import select_series, series_dimension, series_labels
-from lfm_ppl.utils import atomic_files, calendar_time
+from lfm_ppl.utils import atomic_files, calendar_time, checks
 
 TABLE = "forecast.csv"
 FIGURE = "forecast.png"
@@ -77,8 +78,8 @@ def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) 
     known_inputs = {}
     if held_out is not None:
         times = np.union1d(times, held_out.times)
-        known_inputs = {name: table if table.is_dose else Input(*table[:3]) for name, table in (
-            (name, task.observed.inputs[name].continued(later)) for name, later in held_out.inputs.items())}
+        known_inputs = {name: table if table.is_dose else Input(*table[:3])
+                        for name, table in continued_inputs(task.observed.inputs, held_out.inputs).items()}
     keywords: dict[str, Any] = {"inputs": known_inputs, "model_kwargs": task.keywords}
     forecast = lfm_ppl.forecast(task.posterior, task.model, times, draws=options.draws, seed=options.seed,
                                 progress=not options.quiet, **keywords)
@@ -105,8 +106,13 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
                              "out.")
     model = dataclasses.replace(task.file, outputs=observed.outputs, inputs=interpolations)
     columns = choices.inputs(options.columns, model) if interpolations else {}
+    for name, (_, way) in columns.items():
+        if name not in interpolations and way not in ROLES:
+            raise ValueError(checks.unknown("known input of the result", name, interpolations))
     unit = observed.units.get("time", "")
-    time_unit = options.time_unit or arviz_data.attributes(task.posterior).get(TIME_UNIT)
+    time_unit = options.time_unit
+    if time_unit is None and column_unit(path, options.columns.time_column) is None:
+        time_unit = arviz_data.attributes(task.posterior).get(TIME_UNIT)
     read = data.read_csv(path, output_columns(options.columns, model), options.columns.time_column,
                          dict(columns.values()), time_unit or (unit if observed.origin is not None else None),
                          observed=not columns)
@@ -122,8 +128,7 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
     if repeated_rows := int(np.isin(read.times, observed.times).sum()):
         print(f"note     {repeated_rows} of {len(read.times)} rows of {path} are at times of the fitted data: if they "
               "are the same data, their scores are not scores of a forecast")
-    prepared = task.file.prepare(dataclasses.replace(read, inputs={
-        name: observed.inputs[name].continued(later) for name, later in read.inputs.items()}))
+    prepared = task.file.prepare(dataclasses.replace(read, inputs=continued_inputs(observed.inputs, read.inputs)))
     if not np.array_equal(prepared.y, read.y, equal_nan=True):
         raise ValueError(f"{task.file.path} changes the numbers of a data file in `prepare`, so that held-out numbers "
                          "may not be comparable with the fitted ones. Score them in Python, on the model's scale: "

@@ -9,8 +9,7 @@ import numpy as np
 
 from lfm_ppl.cli import session
 from lfm_ppl.io import loading
-from lfm_ppl.io.data_set import Data, InputTable
-from lfm_ppl.io.dosing import ONCE
+from lfm_ppl.io.data_set import ONCE, Data, InputTable
 
 _TYPES = {float: "a number", int: "a whole number", bool: "true or false"}
 

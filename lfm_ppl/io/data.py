@@ -14,8 +14,8 @@ from lfm_ppl.io import table as tables
 from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, Data, InputTable, fill_blanks
 from lfm_ppl.io.data_set import stack_series as stack_series
 from lfm_ppl.io.missing_codes import warn_of_codes
-from lfm_ppl.io.series_columns import check_order
-from lfm_ppl.io.table import Table
+from lfm_ppl.io.series_columns import IDENTIFIERS, check_order
+from lfm_ppl.io.table import Table, words_of
 from lfm_ppl.utils import calendar_time, checks
 
 _ROW_NAMES = re.compile(r"|Unnamed: \d+(\.\d+)*|row\W?names|replicate", re.IGNORECASE)
@@ -171,32 +171,48 @@ def _read(table: Table, outputs: Sequence[str] | None, time_column: str | None,
     interpolations = dict(inputs) if isinstance(inputs, Mapping) else dict.fromkeys(inputs, "previous")
     has_doses = any(way.startswith(DOSE) for way in interpolations.values())
     events = dosing.event_columns(table, interpolations, outputs or ()) if has_doses or outputs else {}
-    interpolations = {name: way for name, way in interpolations.items() if way not in dosing.ROLES}
+    interpolations = {name: way for name, way in interpolations.items() if way.upper() not in dosing.ROLES}
     time_name = time_columns.find_time_column(table, time_column)
     columns = [name for name in table.frame if name != time_name]
+    # A column whose role another column is given is none of the outputs, either.
+    event_names = {name for name in columns if name in events.values() or name.upper() in events} - set(outputs or ())
     names = list(outputs) if outputs is not None else [
         name for name in columns if name not in interpolations and not _ROW_NAMES.fullmatch(name)
-        and name not in events.values()]
+        and name not in event_names and not (has_doses and words_of(name) & IDENTIFIERS)]
     for kind, requested in (("output", names), ("input", interpolations)):
         for name in requested:
             if name not in columns:
                 unknown = checks.unknown(f"{kind} column", name, columns)
-                raise ValueError(f"{table.label}: {unknown} Name the columns with --{kind}s ({kind}s=).")
+                remedy = f"Name the columns with --{kind}s ({kind}s=)."
+                if kind == "input" and interpolations[name].startswith(DOSE):
+                    way = interpolations[name]
+                    remedy = (f"Name the column of the doses: --events COLUMN:{way.removeprefix(DOSE)} "
+                              f"(inputs={{'COLUMN': {way!r}}}).")
+                raise ValueError(f"{table.label}: {unknown} {remedy}")
     if not names or len({*names, *interpolations}) < len(names) + len(interpolations):
         raise ValueError(f"{table.label}: expected at least one output column beside the time {time_name!r}, and each "
                          f"column once, as an output or an input; got the outputs {names} and the inputs "
                          f"{list(interpolations)}.")
-    used = {*interpolations, *events.values(), *(names if outputs is not None or len(names) == 1 else ())}
+    used = {*interpolations, *event_names, *(names if outputs is not None or len(names) == 1 else ())}
     free = [] if part else [name for name in columns if name not in used]
-    time_columns.check_clock(table, time_name, {*interpolations, *events.values(), *(outputs or ())})
+    time_columns.check_clock(table, time_name, {*interpolations, *event_names, *(outputs or ())})
     times, unit, origin = time_columns.read_times(table, time_name, time_unit, usual_unit)
-    check_order(table, time_name, times, free, outputs is not None)
+    is_dosed = dosing.has_amount(table, interpolations)
+    is_unobserved = dosing.is_unobserved(table, events, is_dosed)
+    is_blank = np.all([[tables.is_missing(cell) for cell in table.frame[name]] for name in names], axis=0)
+    check_order(table, time_name, times, free, outputs is not None, ~(is_unobserved | is_blank & is_dosed))
     y = np.column_stack([table.numbers(name) for name in names])
-    y[dosing.is_unobserved(table, events)] = np.nan
+    y[is_unobserved] = np.nan
     if observed and np.isnan(y).all():
         raise ValueError(f"{table.label}: every value of {', '.join(names)}{part} is missing; expected a number.")
     for name, column in zip(names, y.T, strict=True):
         warn_of_codes(table, name, column)
+    if has_doses or outputs:
+        dosing.check_outputs(table, events, names, y, is_dosed, {*interpolations, *names})
+    if has_doses and origin is not None and not (time_unit or usual_unit or time_columns.unit_of(time_name)):
+        dosing.check_unit(table, events, time_name)
+    if not has_doses:
+        dosing.warn_of_unread_doses(table, events)
     doses = {name: way for name, way in interpolations.items() if way.startswith(DOSE)}
     dose_tables = dosing.read_doses(table, doses, times, events, part) if doses else {}
     return Data(times, y, tuple(names), units={"time": unit} if unit else {}, origin=origin, inputs={

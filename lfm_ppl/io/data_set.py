@@ -21,8 +21,18 @@ INTERPOLATIONS = ("previous", "linear", "zero")
 DOSE = "dose:"
 """Beginning of ``dose:STATE,STATE``, which reads a known input as doses to states."""
 
+ONCE = ":once"
+"""End of ``dose:STATE:once``: the column repeats one dose, which is given at the first time."""
+
 OF_SERIES = " of series "
 """Between the name of a known input and the label of its series in a panel."""
+
+
+def dosed_states(interpolation: str) -> tuple[str, ...]:
+    """Return the states in ``dose:STATE,STATE``; none of another interpolation."""
+    if not interpolation.startswith(DOSE):
+        return ()
+    return tuple(interpolation.removeprefix(DOSE).removesuffix(ONCE).split(","))
 
 
 class InputTable(NamedTuple):
@@ -52,7 +62,7 @@ class InputTable(NamedTuple):
     @property
     def dosed_states(self) -> tuple[str, ...]:
         """Names of the states that receive the values as doses; empty for a function of time."""
-        return tuple(self.interpolation.removeprefix(DOSE).split(",")) if self.is_dose else ()
+        return dosed_states(self.interpolation)
 
     def on_clock(self, ratio: float, shift: float) -> InputTable:
         """Return the table with times ``ratio * t + shift``."""
@@ -60,40 +70,79 @@ class InputTable(NamedTuple):
                              durations=None if self.durations is None else self.durations * ratio,
                              resets=None if self.resets is None else self.resets * ratio + shift)
 
-    def continued(self, later: InputTable) -> InputTable:
-        """Return the table up to the first time of a later one, followed by it."""
-        first = later.times.min(initial=np.inf)
-        if later.resets is not None:
-            first = min(first, later.resets.min(initial=np.inf))
-        is_earlier = self.times < first
+    def continued(self, later: InputTable, later_resets: np.ndarray) -> InputTable:
+        """Return the table up to the first time of a later one, followed by it.
 
-        def join(mine: np.ndarray | None, theirs: np.ndarray | None) -> np.ndarray | None:
-            """Return an array of both tables; None where neither has it, zeros where one has none."""
-            if mine is None and theirs is None:
-                return None
-            mine = np.zeros(len(self.times), int) if mine is None else mine
-            return np.append(mine[is_earlier], np.zeros(len(later.times), int) if theirs is None else theirs)
+        The later resets (R,), also of other tables, end the infusions that run. States that only the later table names
+        are added.
 
-        resets = self.resets
-        if later.resets is not None:
-            resets = later.resets if resets is None else np.append(resets[resets < first], later.resets)
-        return InputTable(np.append(self.times[is_earlier], later.times),
-                          np.append(self.values[is_earlier], later.values), self.interpolation,
-                          join(self.durations, later.durations), join(self.compartments, later.compartments), resets)
+        Raises:
+            ValueError: one of the tables holds doses, the other one a function of time.
+        """
+        if self.is_dose != later.is_dose:
+            kinds = [f"doses to {', '.join(table.dosed_states)}" if table.is_dose else "a function of time"
+                     for table in (self, later)]
+            raise ValueError(f"the known input is {kinds[0]} in the fit and {kinds[1]} in the later data; read it in "
+                             "one manner.")
+        earlier_resets, resets = (np.zeros(0) if table.resets is None else table.resets for table in (self, later))
+        end = min(later.times.min(initial=np.inf), resets.min(initial=np.inf))
+        is_earlier = self.times < end
+        times, values = self.times[is_earlier], self.values[is_earlier]
+        if not self.is_dose:
+            return InputTable(np.append(times, later.times), np.append(values, later.values), self.interpolation)
+        durations, later_durations = self.durations_of_all[is_earlier], later.durations_of_all
+        values, durations = end_at_resets(times, values, durations, later_resets)
+        states = list(dict.fromkeys((*self.dosed_states, *later.dosed_states)))
+        index = np.array([states.index(state) for state in later.dosed_states])
+        compartments = np.append(self.compartments_of_all[is_earlier], index[later.compartments_of_all])
+        durations = np.append(durations, later_durations)
+        resets = np.append(earlier_resets[earlier_resets < end], resets)
+        return InputTable(np.append(times, later.times), np.append(values, later.values), DOSE + ",".join(states),
+                          durations if durations.any() else None, compartments if len(states) > 1 else None,
+                          resets if resets.size else None)
+
+    @property
+    def durations_of_all(self) -> np.ndarray:
+        """Lengths (K,) of the infusions, zero for doses at once."""
+        return np.zeros(len(self.times)) if self.durations is None else self.durations
+
+    @property
+    def compartments_of_all(self) -> np.ndarray:
+        """Indices (K,) of the states that receive the doses."""
+        return np.zeros(len(self.times), int) if self.compartments is None else self.compartments
 
     def event_arrays(self) -> dict[tuple[str, str], tuple[np.ndarray, ...]]:
         """Return the arrays of the doses as events: kind and state -> times, values and durations."""
         arrays: dict[tuple[str, str], tuple[np.ndarray, ...]] = {}
         if self.resets is not None and len(self.resets):
             arrays["reset", ""] = self.resets, np.zeros(len(self.resets)), np.zeros(len(self.resets))
-        durations = np.zeros(len(self.times)) if self.durations is None else self.durations
-        compartments = np.zeros(len(self.times), int) if self.compartments is None else self.compartments
+        durations, compartments = self.durations_of_all, self.compartments_of_all
         for index, state in enumerate(self.dosed_states):
             for kind, is_kind in (("dose", durations == 0), ("infusion", durations > 0)):
                 rows = is_kind & (compartments == index)
                 if rows.any():
                     arrays[kind, state] = self.times[rows], self.values[rows], durations[rows]
         return arrays or {("dose", self.dosed_states[0]): (self.times, self.values, durations)}
+
+
+def end_at_resets(times: np.ndarray, values: np.ndarray, durations: np.ndarray,
+                  resets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return amounts (K,) and durations (K,) of doses whose infusions end at the next reset after their start.
+
+    The rate of an infusion stays, and a dose at once (duration zero) is unchanged. ``resets`` (R,) are sorted.
+    """
+    next_reset = np.append(resets, np.inf)[np.searchsorted(resets, times, side="right")]
+    shortened = np.minimum(durations, next_reset - times)
+    is_ended = shortened < durations
+    fraction = np.where(is_ended, shortened, 1.0) / np.where(is_ended, durations, 1.0)
+    return values * fraction, shortened
+
+
+def continued_inputs(tables: Mapping[str, InputTable], later: Mapping[str, InputTable]) -> dict[str, InputTable]:
+    """Return the tables that a later file continues; its resets, in any table, end the infusions in all of them."""
+    resets = np.sort(np.concatenate([np.zeros(0), *(table.resets for table in later.values()
+                                                    if table.resets is not None)]))
+    return {name: tables[name].continued(table, resets) for name, table in later.items()}
 
 
 @dataclass(frozen=True)
@@ -187,6 +236,9 @@ def _input_table(name: str, value: Any, origin: str | None, unit: str) -> InputT
         raise TypeError(f"the known input {name!r} must be (times, values), (times, values, interpolation) or an "
                         f"lfm.Input, got {type(value).__name__}.")
     times, values, interpolation = (*value, "previous")[:3]
+    if interpolation.startswith(DOSE) and interpolation.endswith(ONCE):
+        raise ValueError(f"the known input {name!r}: {interpolation!r} is for a column of a file that repeats a dose; "
+                         f"give the dose once, ([time], [amount], {interpolation.removesuffix(ONCE)!r}).")
     label = f"times of the known input {name!r}"
     checks.refuse_durations(label, times)
     times = calendar_time.positions(label, times, origin, unit)
@@ -197,6 +249,10 @@ def _input_table(name: str, value: Any, origin: str | None, unit: str) -> InputT
         remedy = f"{name!r}: (times, values, 'zero')"
         values = fill_blanks(f"the known input {name!r}", remedy, times, values, interpolation)
         times, values = times[~np.isnan(values)], values[~np.isnan(values)]
+    if interpolation.startswith(DOSE) and (values < 0).any():
+        index = int(np.argmax(values < 0))
+        raise ValueError(f"the known input {name!r}: the dose {values[index]:g} at index {index} is negative; give "
+                         "amounts of zero or more.")
     return InputTable(times, values, "previous" if interpolation == "zero" else interpolation)
 
 

@@ -1,12 +1,14 @@
 """Doses in data files, in the columns of NONMEM's event records.
 
 1. A column of amounts is read as doses to one or several states, "dose:STATE,STATE". Columns named EVID, MDV, ADDL, II,
-   CMT, RATE, DUR and SS, in any case, or given these roles, describe the doses of each row.
+   CMT, RATE, DUR and SS, in any case, or given these roles, describe the doses of each row. A column rate, dur, ss or
+   ii in lower case is one of them beside EVID, MDV, ADDL, CMT or AMT.
 2. EVID 0 is an observation, 1 a dose, 2 neither, 3 a reset of all states to zero, 4 a reset and a dose. Without EVID
    every row with an amount is a dose.
-3. The output of a row is not observed where EVID or MDV is not 0.
-4. ADDL is the number of further doses, at distances of II. RATE or DUR make an infusion of a dose, which ends at a
-   reset. CMT is the number of the state, in the order given, or its name.
+3. The output of a row is not observed where EVID or MDV is not 0. Without them a row with an amount is not observed
+   where the file has CMT, ADDL, II or RATE.
+4. ADDL is the number of additional doses, at distances of II, in the unit of the times. RATE or DUR make an infusion of
+   a dose, which ends at a reset. CMT is the number of the state, in the order given, or its name.
 5. What has no meaning here, or another one, is refused: SS, a RATE of -1 or -2, EVID 2 with a dose.
 
 Source: Beal, Sheiner, Boeckmann and Bauer (2009), NONMEM User's Guides, part VI, chapter V.
@@ -14,52 +16,143 @@ Source: Beal, Sheiner, Boeckmann and Bauer (2009), NONMEM User's Guides, part VI
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from lfm_ppl.io.data_set import DOSE, InputTable
+from lfm_ppl.io.data_set import DOSE, ONCE, InputTable, end_at_resets
 from lfm_ppl.io.missing_codes import warn_of_codes
-from lfm_ppl.io.table import Table, is_missing
+from lfm_ppl.io.table import Table, as_number, is_missing
 from lfm_ppl.utils import checks
 
 ROLES = ("EVID", "MDV", "ADDL", "II", "CMT", "RATE", "DUR", "SS")
 """Names of the columns that describe events."""
 
-ONCE = ":once"
-"""End of ``dose:STATE:once``: the column repeats one dose, which is given at the first time."""
+_UNAMBIGUOUS = ("EVID", "MDV", "ADDL", "CMT", "AMT")
+"""Names of columns that no measurement has, in any case."""
 
 _FEWEST_REPEATED = 3
 """Number of rows from which equal doses in all of them are suspect."""
 
 
-def event_columns(table: Table, ways: Mapping[str, str], outputs: Collection[str]) -> dict[str, str]:
+def event_columns(table: Table, interpolations: Mapping[str, str], outputs: Collection[str]) -> dict[str, str]:
     """Return the columns that describe events: role -> column.
+
+    A column such as rate, in lower case, may be a measurement. It has a role only beside another column of dosing.
 
     Args:
         table: the data.
-        ways: columns of known inputs -> how they are read, or their role.
+        interpolations: columns of known inputs -> how they are read, or their role, in any case.
         outputs: columns that are outputs, which have no role by their name.
+
+    Raises:
+        ValueError: a column that is given a role is not in the table, or two columns are given the same role.
     """
-    by_way = {way: name for name, way in ways.items() if way in ROLES}
+    by_option: dict[str, str] = {}
+    for name, role in ((name, role.upper()) for name, role in interpolations.items() if role.upper() in ROLES):
+        if name not in table.frame:
+            raise ValueError(f"{table.label}: {checks.unknown(f'column of {role}', name, list(table.frame))}")
+        if role in by_option:
+            raise ValueError(f"{table.label}: the columns {by_option[role]!r} and {name!r} are both given the role "
+                             f"{role}; give it to one of them.")
+        by_option[role] = name
+    has_dosing = by_option or any(name.upper() in _UNAMBIGUOUS for name in table.frame)
     by_name = {name.upper(): name for name in table.frame
-             if name.upper() in ROLES and name not in ways and name not in outputs}
-    return {**by_name, **by_way}
+               if name.upper() in ROLES and name not in interpolations and name not in outputs
+               and (name.isupper() or name.upper() in _UNAMBIGUOUS or has_dosing)}
+    return {**by_name, **by_option}
 
 
-def is_unobserved(table: Table, columns: Mapping[str, str]) -> np.ndarray:
-    """Return whether the outputs of a row are no observations, (T,)."""
+def has_amount(table: Table, interpolations: Mapping[str, str]) -> np.ndarray:
+    """Return whether a row has an amount that is given in this row, and not a repeated one, (T,)."""
+    columns = [name for name, way in interpolations.items() if way.startswith(DOSE) and not way.endswith(ONCE)]
+    return np.any([np.nan_to_num(table.numbers(name)) != 0 for name in columns] or [np.zeros(len(table.frame), bool)],
+                  axis=0)
+
+
+def is_unobserved(table: Table, columns: Mapping[str, str], is_dosed: np.ndarray) -> np.ndarray:
+    """Return whether the outputs of a row are no observations, (T,).
+
+    Without EVID and MDV a row with an amount is none where the file has another column of NONMEM's, as in NM-TRAN.
+    ``is_dosed`` (T,) are the rows with an amount.
+    """
+    if not {"EVID", "MDV"} & set(columns):
+        return is_dosed if {"CMT", "ADDL", "II", "RATE"} & set(columns) else np.zeros(len(is_dosed), bool)
     numbers = _numbers(table, {role: columns[role] for role in ("EVID", "MDV") if role in columns})
     return (numbers["EVID"] != 0) | (numbers["MDV"] != 0)
 
 
-def read_doses(table: Table, ways: Mapping[str, str], times: np.ndarray, columns: Mapping[str, str],
+def check_outputs(table: Table, columns: Mapping[str, str], names: Sequence[str], y: np.ndarray,
+                  is_dosed: np.ndarray, used: Collection[str]) -> None:
+    """Raise ValueError where CMT or DVID tells the observations in one column apart.
+
+    Warn where the outputs are zero in all rows with a dose, which may stand for no observation.
+
+    Args:
+        table: the data.
+        columns: role -> column, from `event_columns`.
+        names: the D outputs.
+        y: (T, D), NaN where a row is no observation.
+        is_dosed: (T,), rows with an amount, whose CMT is that of the dose.
+        used: columns that are outputs or inputs.
+    """
+    labelling = [name for name in table.frame if name == columns.get("CMT") or name.upper() == "DVID"]
+    for column in (name for name in labelling if name not in used):
+        for name, values in zip(names, y.T, strict=True):
+            cells = table.frame[column]
+            rows = [row for row in np.flatnonzero(np.isfinite(values) & ~is_dosed).tolist()
+                    if not is_missing(cells.iloc[row])]
+            labels = [_label(cells.iloc[row]) for row in rows]
+            if len(set(labels)) > 1:
+                row = next(row for row, label in zip(rows, labels, strict=True) if label != labels[0])
+                raise ValueError(f"{table.location(row, column)}: the column has {len(set(labels))} values in rows "
+                                 f"with an observation of {name}, so that it tells outputs apart; give each output a "
+                                 "column, with blank cells in the rows of the others.")
+    if {"EVID", "MDV"} & set(columns) or is_dosed.all() or not is_dosed.any():
+        return
+    for name, values in zip(names, y.T, strict=True):
+        if (values[is_dosed] == 0).all():
+            checks.warn(f"{table.label}, column {name!r}: the output is 0 in all rows with a dose. If it was not "
+                        "measured there, leave the cells blank, or write MDV 1 in these rows.")
+
+
+def _label(cell: Any) -> str:
+    """Return a cell as text, the same for 1 and 1.0."""
+    number = as_number(cell)
+    return str(cell).strip() if number is None else f"{number:g}"
+
+
+def warn_of_unread_doses(table: Table, columns: Mapping[str, str]) -> None:
+    """Warn where the columns of events mark doses, and no column of amounts is read."""
+    if not {"EVID", "ADDL", "AMT"} & {name.upper() for name in table.frame}:
+        return  # SS alone may be a sum of squares
+    numbers = _numbers(table, {role: column for role, column in columns.items() if role in ("EVID", "ADDL", "SS")})
+    marks = {"EVID": np.isin(numbers["EVID"], (1, 3, 4)), "ADDL": numbers["ADDL"] != 0, "SS": numbers["SS"] != 0}
+    for role, is_marked in marks.items():
+        if is_marked.any():
+            amount = next((name for name in table.frame if name.upper() in ("AMT", "DOSE")), "COLUMN")
+            checks.warn(f"{table.label}, column {columns[role]!r}: the file marks doses or resets, and none is read; "
+                        f"name the column of amounts: --events {amount}:STATE (inputs={{{amount!r}: "
+                        f"'{DOSE}STATE'}}).")
+            return
+
+
+def check_unit(table: Table, columns: Mapping[str, str], time_name: str) -> None:
+    """Raise ValueError for II, DUR or RATE beside dates whose unit of time nothing names."""
+    for role, column in columns.items():
+        if role in ("II", "DUR", "RATE") and (rows := np.flatnonzero(np.nan_to_num(table.numbers(column)) > 0)).size:
+            raise ValueError(f"{table.location(rows[0], column)}: the times in {time_name!r} are dates, so that the "
+                             f"unit of time of {role} is not known; name it: --time-unit h (time_unit='h').")
+
+
+def read_doses(table: Table, interpolations: Mapping[str, str], times: np.ndarray, columns: Mapping[str, str],
                part: str = "") -> dict[str, InputTable]:
     """Return the doses by their column of amounts. Resets belong to the first column.
 
     Args:
         table: the data.
-        ways: columns of amounts -> "dose:STATE,...".
+        interpolations: columns of amounts -> "dose:STATE,...".
         times: (T,), of the rows.
         columns: role -> column, from `event_columns`.
         part: name of the series in messages.
@@ -67,23 +160,23 @@ def read_doses(table: Table, ways: Mapping[str, str], times: np.ndarray, columns
     Raises:
         ValueError: a row says something that is not read, or contradicts itself; the message names it.
     """
-    cells = {name: table.numbers(name) for name in ways}
+    cells = {name: table.numbers(name) for name in interpolations}
     for name, numbers in cells.items():
         warn_of_codes(table, name, numbers)
     amounts = {name: np.nan_to_num(numbers) for name, numbers in cells.items()}
-    if "CMT" in columns and len(ways) > 1:
+    if "CMT" in columns and len(interpolations) > 1:
         raise ValueError(f"{table.label}: the column {columns['CMT']!r} says which state receives a dose, and there "
-                         f"are doses in several columns, {', '.join(ways)}. Give the states of one column: "
-                         f"{next(iter(ways))}:STATE,STATE.")
+                         f"are doses in several columns, {', '.join(interpolations)}. Give the states of one column: "
+                         f"{next(iter(interpolations))}:STATE,STATE.")
     rows = _numbers(table, {role: column for role, column in columns.items() if role != "CMT"})
-    has_amount = np.any([values != 0 for values in amounts.values()], axis=0)
+    is_dosed = np.any([values != 0 for values in amounts.values()], axis=0)
     _check_amounts(table, amounts)
     if "EVID" not in columns:
-        rows["EVID"] = np.where(has_amount, 1.0, 0.0)
-    _check_events(table, columns, rows, has_amount)
+        rows["EVID"] = np.where(is_dosed, 1.0, 0.0)
+    _check_events(table, columns, rows, is_dosed)
     resets = np.unique(times[np.isin(rows["EVID"], (3, 4))])
     tables = {}
-    for index, (name, way) in enumerate(ways.items()):
+    for index, (name, way) in enumerate(interpolations.items()):
         doses = _doses_of_column(table, name, way, times, columns, {**rows, "AMT": amounts[name]}, resets, part)
         tables[name] = doses._replace(resets=resets) if index == 0 and resets.size else doses
     return tables
@@ -106,7 +199,7 @@ def _check_events(table: Table, columns: Mapping[str, str], rows: Mapping[str, n
                   has_amount: np.ndarray) -> None:
     """Raise ValueError for the first row with an event that is not read."""
     evid, is_dose = rows["EVID"], np.isin(rows["EVID"], (1, 4))
-    rate, duration, further = rows["RATE"], rows["DUR"], rows["ADDL"]
+    rate, duration, additional = rows["RATE"], rows["DUR"], rows["ADDL"]
     is_infused = (rate != 0) | (duration != 0)
     problems = {
         "EVID": [(~np.isin(evid, range(5)), "EVID must be 0 (observation), 1 (dose), 2 (neither), 3 (reset) or 4 "
@@ -125,8 +218,9 @@ def _check_events(table: Table, columns: Mapping[str, str], rows: Mapping[str, n
         "DUR": [(is_dose & (duration < 0), "the duration of an infusion must be above zero"),
                 (is_dose & (duration > 0) & (rate > 0), "RATE and DUR both give the length of the infusion; leave one "
                                                         "blank")],
-        "ADDL": [(is_dose & ((further < 0) | (further % 1 != 0)), "ADDL must be the number of further doses"),
-                 (is_dose & (further > 0) & (rows["II"] <= 0), "ADDL needs the time between the doses in II")],
+        "ADDL": [(is_dose & ((additional < 0) | (additional % 1 != 0)), "ADDL must be the number of additional "
+                                                                                  "doses"),
+                 (is_dose & (additional > 0) & (rows["II"] <= 0), "ADDL needs the time between the doses in II")],
     }
     for role, cases in problems.items():
         for is_wrong, message in cases:
@@ -136,7 +230,7 @@ def _check_events(table: Table, columns: Mapping[str, str], rows: Mapping[str, n
 
 def _doses_of_column(table: Table, name: str, way: str, times: np.ndarray, columns: Mapping[str, str],
                      rows: Mapping[str, np.ndarray], resets: np.ndarray, part: str) -> InputTable:
-    """Return the doses in one column of amounts, with further doses (ADDL) and lengths of infusions."""
+    """Return the doses in one column of amounts, with additional doses (ADDL) and lengths of infusions."""
     amounts = rows["AMT"]
     is_once = way.endswith(ONCE)
     way = way.removesuffix(ONCE)
@@ -154,23 +248,19 @@ def _doses_of_column(table: Table, name: str, way: str, times: np.ndarray, colum
     states = way.removeprefix(DOSE).split(",")
     compartment = _compartments(table, columns.get("CMT"), name, states, index)
     duration = np.where(rows["RATE"] > 0, amounts / np.where(rows["RATE"] > 0, rows["RATE"], 1.0), rows["DUR"])
-    is_repeated = (times[index[1:]] == times[index[:-1]]) & (compartment[1:] == compartment[:-1])
-    if "EVID" not in columns and is_repeated.any():
-        row = index[1:][is_repeated][0]
+    # A dose at once and an infusion, or infusions of different lengths, are events of their own.
+    _, first = np.unique([times[index], compartment, duration[index]], axis=1, return_index=True)
+    if "EVID" not in columns and len(first) < len(index):
+        row = index[np.setdiff1d(np.arange(len(index)), first)[0]]
         raise ValueError(f"{table.location(row, name)}: there are two doses at one time; write their sum in one row.")
     count = rows["ADDL"][index].astype(int) + 1
     source = np.repeat(index, count)
-    further = np.arange(len(source)) - np.repeat(np.cumsum(count) - count, count)
-    dose_times = times[source] + further * rows["II"][source]
+    repetition = np.arange(len(source)) - np.repeat(np.cumsum(count) - count, count)
+    dose_times = times[source] + repetition * rows["II"][source]
     order = np.argsort(dose_times, kind="stable")
     source, dose_times, compartment = source[order], dose_times[order], np.repeat(compartment, count)[order]
     values, durations = amounts[source], duration[source]
-    if resets.size:
-        # A reset ends the infusions that run.
-        reset_after = np.append(resets, np.inf)[np.searchsorted(resets, dose_times, side="right")]
-        shortened = np.minimum(durations, reset_after - dose_times)
-        values = np.where(durations > 0, values * shortened / np.where(durations > 0, durations, 1.0), values)
-        durations = shortened * (durations > 0)
+    values, durations = end_at_resets(dose_times, values, durations, resets)
     return InputTable(dose_times, values, way, durations if durations.any() else None,
                       compartment if len(states) > 1 else None)
 

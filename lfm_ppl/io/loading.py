@@ -273,7 +273,7 @@ class SourceLocation:
     shipped: bool
 
 
-def place_in_model(error: BaseException) -> SourceLocation | None:
+def location_in_model(error: BaseException) -> SourceLocation | None:
     """Return the last line of a model file that led to an error, or to its cause; None where none did."""
     location = None
     cause: BaseException | None = error

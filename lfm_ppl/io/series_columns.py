@@ -9,30 +9,43 @@ import numpy as np
 
 from lfm_ppl.io.table import Table, as_number, is_missing, words_of
 
-_IDENTIFIERS = frozenset((
+IDENTIFIERS = frozenset((
     "id", "ids", "subject", "subj", "subjid", "subjectid", "usubjid", "patient", "patientid", "participant", "person",
     "volunteer", "individual", "indiv", "animal", "animalid", "series", "group", "name", "who"))
 """Words in the names of columns that identify the series of a row."""
 
-_SUBJECTS = _IDENTIFIERS | frozenset((
+_SUBJECTS = IDENTIFIERS | frozenset((
     "mouse", "rat", "dog", "pig", "rabbit", "monkey", "sheep", "cow", "fish", "bird", "plant", "tree", "child",
     "household", "customer", "cage", "plot", "tank", "well"))
 """These, and words that also name measurements, such as the number of sheep."""
+
+_FACTORS = frozenset(("group", "name", "who"))
+"""Words that name factors and remarks, too, where the outputs are named."""
 
 _REPLICATES = frozenset(("replicate", "replicates", "replication", "rep", "reps", "repl", "repeat", "duplicate",
                          "triplicate", "technical"))
 """Words in the names of columns that number the measurements of one time."""
 
 
-def check_order(table: Table, time_name: str, times: np.ndarray, free: Sequence[str], is_unused: bool) -> None:
+def check_order(table: Table, time_name: str, times: np.ndarray, free: Sequence[str], is_unused: bool,
+                is_observed: np.ndarray) -> None:
     """Raise ValueError where the time goes back, or where several series seem to stand in one table.
 
-    ``free`` are the columns that may hold identifiers of series; ``is_unused``: see `_merged_series_column`.
+    Args:
+        table: the table.
+        time_name: the column of times.
+        times: (T,).
+        free: the columns that may hold identifiers of series.
+        is_unused: see `_merged_series_column`.
+        is_observed: (T,), rows that are no rows of doses, in which such a column may be blank or a code.
     """
     cells = table.frame[time_name].to_numpy()
     rows = np.flatnonzero(np.diff(times) < 0)
-    series = _series_column(table, times, free) if rows.size else _merged_series_column(
-        table, times, free, is_unused)
+    if rows.size:
+        series = _series_column(table, times, free)
+    else:
+        table, times = Table(table.label, table.frame[is_observed]), times[is_observed]
+        series = _merged_series_column(table, times, free, is_unused) if len(times) else None
     if series is not None:
         labels = table.frame[series].astype(str).to_numpy()
         row = (rows if rows.size else np.flatnonzero(labels[1:] != labels[:-1]))[0] + 1
@@ -66,7 +79,7 @@ def _series_column(table: Table, times: np.ndarray, free: Sequence[str]) -> str 
         if words_of(name) & _REPLICATES or len(labels) == 1 or goes_back.any() or any(
                 map(is_missing, table.frame[name])):
             continue
-        if words_of(name) & (_IDENTIFIERS | {"unit"}):
+        if words_of(name) & (IDENTIFIERS | {"unit"}):
             return name
         if 1 + np.count_nonzero(np.diff(index)) == len(labels) <= len(index) / 2:
             candidates.append(name)
@@ -97,7 +110,9 @@ def _merged_series_column(table: Table, times: np.ndarray, free: Sequence[str], 
         labels, index, counts = np.unique(cells.astype(str), return_inverse=True, return_counts=True)
         if len(labels) == 1:
             continue
-        identifiers = _SUBJECTS if is_unused or kind is str else _IDENTIFIERS
+        identifiers = _SUBJECTS if is_unused or kind is str else IDENTIFIERS
+        if is_unused:
+            identifiers -= _FACTORS
         if words & identifiers and counts[counts > 1].sum() >= len(index) / 2:
             return name
         rows = np.zeros((instant.max() + 1, len(labels)), int)

@@ -35,7 +35,7 @@ class Table:
     frame: pd.DataFrame
 
     def location(self, row: int, column: str) -> str:
-        """Return the place of a cell."""
+        """Return the location of a cell."""
         return f"{self.label}, row {self.frame.index[row]}, column {column!r}"
 
     def numbers(self, column: str, requirement: str = _NUMBER) -> np.ndarray:

@@ -29,7 +29,7 @@ def find_time_column(table: Table, time_column: str | None) -> str:
         raise ValueError(f"{table.label}: {unknown}")
     first_cells = {name: next((cell for cell in table.frame[name] if not is_missing(cell)), None) for name in header}
     candidates = ([name for name in header if name == time_column]
-                  or [name for name in header if name.lower() == "time" or name == "t" or _unit_of(name)]
+                  or [name for name in header if name.lower() == "time" or name == "t" or unit_of(name)]
                   or [name for name in header if name.lower() in ("date", "datetime", "timestamp")]
                   or [name for name in header if calendar_time.is_date(first_cells[name])]
                   or [name for name in header if _names_dates(name)
@@ -42,7 +42,7 @@ def find_time_column(table: Table, time_column: str | None) -> str:
     return candidates[0]
 
 
-def _unit_of(time_name: str) -> str | None:
+def unit_of(time_name: str) -> str | None:
     """Return h for ``time_h``, None where the name has no unit."""
     stem, _, unit = time_name.partition("_")
     return calendar_time.UNITS.get(unit) if stem.lower() == "time" else None
@@ -59,7 +59,7 @@ def read_times(table: Table, name: str, unit: str | None,
     cells = table.frame[name].to_numpy()
     if (rows := np.flatnonzero([is_missing(cell) for cell in cells])).size:
         raise ValueError(f"{table.location(rows[0], name)}: the time is missing.")
-    named_unit, origin = _unit_of(name), None
+    named_unit, origin = unit_of(name), None
     if (dates := calendar_time.compact_dates(cells)) is not None:
         if unit or _names_dates(name):
             cells = np.array(dates, object)

@@ -127,8 +127,8 @@ def check_offsets(origins: Mapping[str, str | None]) -> None:
     """Raise ValueError where the clocks of some origins, by name, have an offset from UTC and others have none."""
     has_offset = {name: datetime.fromisoformat(origin).tzinfo is not None for name, origin in origins.items() if origin}
     if len(set(has_offset.values())) > 1:
-        with_offset, without = (next(name for name, value in has_offset.items() if value is wanted)
-                                for wanted in (True, False))
+        with_offset, without = (next(name for name, value in has_offset.items() if value is offset)
+                                for offset in (True, False))
         raise ValueError(f"the times of {with_offset!r} have an offset from UTC, and those of {without!r} have none; "
                          "give an offset in all of them, or in none.")
 

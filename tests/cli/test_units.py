@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,11 @@ def test_a_conversion_is_printed(write, capsys):
     model = load(ROOM)
     _print_data(options, model, observed_data(options.data, model, {}), {})
     assert "time     in h, the unit of the model" in capsys.readouterr().out
+    for text, words in ((table(HOURS / 24, "time_d"), "converted from d"), (table(HOURS, "time_h"), ""),
+                        (table(HOURS), ""), (table(HOURS * 60, "time_min"), "converted from min")):
+        options = FitArguments(data=DataOptions(data=write(text)))
+        _print_data(options, model, observed_data(options.data, model, {}), {})
+        assert (words or "data ") in (output := capsys.readouterr().out) and ("converted" in output) == bool(words)
 
 
 @pytest.mark.parametrize(("name", "unit"), [("time", "d"), ("time_h", None)])
@@ -82,7 +88,8 @@ def fitted(unit_of_file, origin=None):
 
 @pytest.mark.parametrize(("text", "unit_of_fit", "unit"), [
     (table([48, 60]), None, None), (table([2, 2.5]), "d", None), (table([2, 2.5]), None, "d"),
-    (table([48, 60]), "d", "h"), (table([2, 2.5], "time_d"), None, None),
+    (table([48, 60]), "d", "h"), (table([2, 2.5], "time_d"), None, None), (table([48, 60], "time_h"), "d", None),
+    (table([2, 2.5], "time_d"), "h", None),
 ])
 def test_held_out_data_have_the_unit_of_the_file_that_was_fitted(write, text, unit_of_fit, unit):
     read = _held_out_data(write(text), ForecastOptions(time_unit=unit), fitted(unit_of_fit))
@@ -97,11 +104,26 @@ def test_held_out_dates_are_counted_from_the_origin_of_the_fit(write):
         np.testing.assert_allclose(read.times, [48.0, 60.0])
 
 
+def test_held_out_doses_to_several_states_have_the_name_of_the_fit(write):
+    observed = Data(HOURS, np.zeros((3, 1)), ("concentration",), {"time": "h"},
+                    inputs={"dose": ([0.0], [4.0], "dose:gut,central")})
+    task = dataclasses.replace(fitted(None), observed=observed, file=load("pharmacokinetics"))
+    path = write("time,concentration,AMT,CMT\n48,.,7,2\n60,1,.,.\n")
+    for events in ("AMT:gut,central", "AMT:gut,other"):
+        read = _held_out_data(path, ForecastOptions(columns=Columns(events=events)), task)
+        assert read.inputs["dose"].compartments.tolist() == [1]
+    with pytest.raises(ValueError, match="unknown known input of the result 'AMT'.*Known: dose"):
+        _held_out_data(path, ForecastOptions(columns=Columns(events="AMT:liver,gut")), task)
+
+
 def test_rows_of_doses_are_no_missing_values(capsys):
     data = Data([0.0, 1.0, 2.0, 3.0], [[np.nan], [1.0], [np.nan], [2.0]], ("x",),
-                inputs={"AMT": ([0.0], [4.0], "dose:gut")})
+                inputs={"AMT": ([0.0], [4.0], "dose:gut"), "heat": ([0.0, 2.0], [1.0, 2.0])})
     _print_data(FitArguments(), load("spring"), data, {})
     assert "4 rows of x; 1 values missing" in capsys.readouterr().out
+    infused = data.inputs["AMT"]._replace(durations=np.array([2.0]))
+    _print_data(FitArguments(), load("spring"), dataclasses.replace(data, inputs={"AMT": infused}), {})
+    assert "AMT (dose:gut, 1 dose of 4 in all, 1 by infusion)" in capsys.readouterr().out
     panel = Data([[0.0, 1.0], [0.0, 1.0]], [[[np.nan], [1.0]], [[np.nan], [2.0]]], ("x",), series=("a", "b"),
                  inputs={"AMT of series b": ([0.0], [4.0], "dose:gut")})
     _print_data(FitArguments(), load("spring"), panel, {})

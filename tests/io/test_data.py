@@ -196,7 +196,8 @@ def test_series_whose_times_do_not_go_back_are_not_merged(write, text):
     "time,id,x\n0,1,9\n1,2,8\n2,3,3\n", "time,animal,x\n0,1,9\n0,2,8\n2,3,3\n2,4,3\n",  # each measured once
     "time,ID,x\n0,7,9\n1,7,8\n2,7,3\n", "time,dose,x\n0,1.5,9\n0,2.5,8\n1,1.5,3\n1,2.5,3\n",
     "time,day,x\n0,1,9\n12,1,8\n24,2,7\n36,2,5\n", "time,rat1,rat2,x\n0,3,4,9\n1,3,5,9\n2,4,5,8\n",
-    "time,ID,x\n0,,9\n1,,8\n2,,3\n",
+    "time,ID,x\n0,,9\n1,,8\n2,,3\n", "time,group,x\n0,a,9\n1,a,8\n2,b,3\n3,b,2\n",
+    "time,who,x\n0,Ann,9\n1,Bo,8\n2,Ann,3\n3,Bo,2\n", "time,name,x\n0,calm,9\n1,calm,8\n2,storm,3\n3,storm,2\n",
 ], ids=lambda text: text[5:30].replace("\n", " "))
 def test_columns_that_do_not_identify_series_raise_no_alarm(write, text):
     assert read_csv(write(text), outputs=["x"]).y[0, 0] == 9
