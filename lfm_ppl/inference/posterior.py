@@ -118,7 +118,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     if _PRODUCT not in paths:
         return paths
     if not is_stiff and np.max(paths[_PRODUCT], initial=0.0) > LONGEST_PRODUCT:
-        # Not stored: the batches of the store are those of the explicit steps.
+        # The store holds batches of paths with explicit steps.
         paths = _paths(key, bound, draws, at, settings, True, report=report, store=None)
     del paths[_PRODUCT]
     warn_of_infinite_states(paths["state"], bound.times if at is None else at,

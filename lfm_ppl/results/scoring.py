@@ -264,7 +264,7 @@ def _on_clock(held_out: Any, origin: str | None, unit: str) -> Any:
     """Return held-out data whose dates are counted from the origin of the result, in its unit of time."""
     if isinstance(held_out, Data) and unit and (held_out.origin is None) != (origin is None):
         kinds = ("numbers", "dates") if origin is not None else ("dates", "numbers")
-        raise ValueError(f"the times of held_out are {kinds[0]}, and those of the result are {kinds[1]}; give "
+        raise ValueError(f"the times of held_out are {kinds[0]}, and the times of the result are {kinds[1]}; give "
                          f"{kinds[1]}.")
     if isinstance(held_out, Data):
         return at_origin(held_out, origin, unit) if held_out.origin and origin else in_unit(held_out, unit)

@@ -129,8 +129,8 @@ def check_offsets(origins: Mapping[str, str | None]) -> None:
     if len(set(has_offset.values())) > 1:
         with_offset, without = (next(name for name, value in has_offset.items() if value is offset)
                                 for offset in (True, False))
-        raise ValueError(f"the times of {with_offset!r} have an offset from UTC, and those of {without!r} have none; "
-                         "give an offset in all of them, or in none.")
+        raise ValueError(f"the times of {with_offset!r} have an offset from UTC, and the times of {without!r} have "
+                         "none; give an offset in all of them, or in none.")
 
 
 def positions(name: str, values: Any, origin: str | None, unit: str) -> Any:

@@ -85,7 +85,7 @@ def _check_unit_of_inputs(model_kwargs: Mapping[str, Any] | None, data: Data | N
     for member in members:
         if any(np.array_equal(member.times, table.times) for table in data.inputs.values()):
             raise ValueError(f"model_kwargs hold a known input or doses of the data with times in {unit}, and the "
-                             f"model counts {model_unit}. Leave them out: the model gets those of the data, converted.")
+                             f"model counts {model_unit}. Leave them out: the model gets them, converted.")
     if data.origin is None:
         checks.warn(f"the times of the data are converted from {unit} to {model_unit}, the unit of the model. The "
                     f"times of known inputs and doses in model_kwargs are not, and are taken to be in {model_unit}.")
