@@ -340,9 +340,9 @@ def refuse_times_by_site(times: Any) -> None:
                         f"{', '.join(map(str, times)) or 'none'}: write times[{name!r}], and obs=y[{name!r}].")
 
 
-def repeat_draw(draw: Callable[[jax.Array], jax.Array], key: jax.Array, sample_shape: tuple[int, ...]) -> jax.Array:
-    """Return independent draws (*sample_shape, ...) of ``draw(key)``; one draw where the shape is empty."""
+def repeat_draw(draw: Callable[[jax.Array], Any], key: jax.Array, sample_shape: tuple[int, ...]) -> Any:
+    """Return independent draws (*sample_shape, ...) of the arrays ``draw(key)``; one draw where the shape is empty."""
     if not sample_shape:
         return draw(key)
     draws = jax.vmap(draw)(jax.random.split(key, int(np.prod(sample_shape))))
-    return draws.reshape(*sample_shape, *draws.shape[1:])
+    return jax.tree.map(lambda a: a.reshape(*sample_shape, *a.shape[1:]), draws)

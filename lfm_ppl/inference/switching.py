@@ -38,6 +38,7 @@ from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
+from lfm_ppl.model.stiff_simulation import warn_of_infinite_states
 from lfm_ppl.particles.stochastic_steps import choose_scheme
 from lfm_ppl.switching.chain import MarkovChain, check_probabilities, check_rates, transition_matrices
 from lfm_ppl.switching.regime_model import check_models, joint_model
@@ -156,7 +157,11 @@ class Switching(SeriesLikelihood):
         return {name: getattr(self, name) for name in ("rule", "steps", "max_step", "initial", "merging", "method")}
 
     def with_settings(self, **settings: Any) -> Switching:
-        """Return the same distribution with another ``rule``, ``steps``, ``max_step`` or ``method``."""
+        """Return the same distribution with another ``rule``, ``steps``, ``max_step`` or ``method``.
+
+        They are the numerics of each regime. ``merging`` is none: it is the approximation itself, with the number of
+        filters, as ``initial`` is a part of the model. For another one construct the distribution again.
+        """
         names = ("rule", "steps", "max_step", "method")
         for name in settings:
             if name not in names:
@@ -303,8 +308,14 @@ class Switching(SeriesLikelihood):
         return self._with_indicators(candidates[indices, jnp.arange(len(times))], indices), times
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
-        """Simulate the real model: (*sample_shape, T, D)."""
-        return repeat_draw(lambda key: self.simulate(key)[1], key, sample_shape)
+        """Simulate the real model: (*sample_shape, T, D).
+
+        Outside of compiled code, a state that is not finite is a warning, as in `lfm_ppl.simulate`.
+        """
+        inputs, y = repeat_draw(self.simulate, key, sample_shape)
+        state_names = self.models[0].state_names
+        warn_of_infinite_states(inputs[..., :len(state_names)], self.times, state_names)
+        return y
 
     def simulate(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Simulate the real model: (x, indicators of the regimes, u) (T, M + K + R), and observations (T, D)."""
