@@ -173,15 +173,15 @@ def _linear_part_error(dynamics: Dynamics, factor: IntegratingFactor, h: jax.Arr
                        stage1: DriftLinearization) -> tuple[jax.Array, jax.Array]:
     """Return the errors of the mean (M,) and the covariance (M, n) due to a fast linear part.
 
-    The step replaces the integral of exp(A s) r ds, of the rest r of the dynamics, by Simpson's rule W r. Its error e
-    obeys A e = A W r - (exp(A h) - 1) r, and each row of e is about that over the state's own rate. The noise D obeys
-    the same with A D + D A'.
+    The step replaces the integral of exp(A s) r ds, of the remainder r of the dynamics, by Simpson's rule W r. Its
+    error e obeys A e = A W r - (exp(A h) - 1) r, and each row of e is about that over the state's own rate. The noise D
+    obeys the same with A D + D A'.
     """
     size = dynamics.ssm.physical_dim
     matrix = dynamics.linear.rows[:, :size]
     full, half, identity = factor.full[:size, :size], factor.half[:size, :size], jnp.eye(size)
-    rest = jnp.concatenate([matmul(stage1.jacobian, start.covariance), stage1.remainder[:, None]], axis=1)
-    residual = matmul(h / 6 * matmul(matrix, full + 4.0 * half + identity) - (full - identity), rest)
+    remainder = jnp.concatenate([matmul(stage1.jacobian, start.covariance), stage1.remainder[:, None]], axis=1)
+    residual = matmul(h / 6 * matmul(matrix, full + 4.0 * half + identity) - (full - identity), remainder)
     rate = jnp.abs(diagonal(matrix))
     error = residual / (rate + 1.0 / h)[:, None]
     covariance = error[:, :-1].at[:, :size].add(error[:, :size].T)

@@ -152,8 +152,8 @@ class Infusion(Event):
 
     Args:
         times: (K,), starts, in any order; not before the initial time of the model. They may be traced.
-        amounts: d_k (K,), or one number for all; they may be parameters. A negative amount is removed, as by a `Dose`; it
-            needs ``duration``. Where an amount is zero, nothing is infused.
+        amounts: d_k (K,), or one number for all; they may be parameters. A negative amount is removed, as by a `Dose`;
+            it needs ``duration``. Where an amount is zero, nothing is infused.
         target: name of the state that receives the amounts, or the direction b (M,).
         rate: amount in a unit of time, (K,) or one number for all; either it or ``duration`` is given.
         duration: T_k, (K,) or one number for all.
@@ -199,8 +199,8 @@ class Infusion(Event):
         divisor = jnp.where(is_positive, value, 1.0) if checks.traced(value) else value
         quotient = self.values / divisor
         if rate is not None and not checks.traced(quotient) and np.any(quotient < 0):
-            raise ValueError(f"amounts of an infusion with rate= must not be negative, got {np.min(self.values):g}: the "
-                             "infusion would end before it starts. Use duration= for amounts that are removed.")
+            raise ValueError(f"amounts of an infusion with rate= must not be negative, got {np.min(self.values):g}: "
+                             "the infusion would end before it starts. Use duration= for amounts that are removed.")
         if rate is None:
             self.rates, self.durations = quotient, value
         else:

@@ -164,5 +164,6 @@ def test_regimes_are_named_by_the_smoother_and_before_a_fit():
 
 
 def test_a_fit_says_it_before_it_samples():
-    said = messages(lambda: lfm.fit(stiff_model, ROWS, Y, sampler="map", samples=2, trajectory_draws=0, progress=False))[1]
+    said = messages(lambda: lfm.fit(stiff_model, ROWS, Y, sampler="map", samples=2, trajectory_draws=0,
+                                    progress=False))[1]
     assert len(said) == 1 and "'drug'" in said[0] and "row 0" in said[0]
