@@ -362,7 +362,7 @@ def substep_series(feedback: jax.Array, dt: ArrayLike) -> tuple[jax.Array, jax.A
         Terms ``(F h)^k / k!`` (K, n, n), k = 0, 1, ..., the substep h and the number s of doublings.
     """
     doublings = doublings_for(_growth(jax.lax.stop_gradient(feedback * dt)))
-    step = dt * jnp.exp2(-doublings)
+    step = jnp.exp2(-doublings) * dt
     return _power_series(feedback * step), step, doublings
 
 
