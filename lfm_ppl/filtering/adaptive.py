@@ -3,8 +3,8 @@
 1. Where the fifth stage, which is the next step's first, replaces the fourth, Runge-Kutta's formula has order three.
    The difference of the two results, e = h (k_4 - k_5) / 6, estimates the error of a step at no cost, in the mean and
    in the covariance, in standard deviations. An exponential step predicts its end with order two as well; the estimate
-   is the difference of the two predictions. Where only the forces enter non-linearly, both stages are equal; the step is
-   then taken as two by Simpson's rule (`simpson`), whose weights resolve a fast linear part, and the estimate is the
+   is the difference of the two predictions. Where only the forces enter non-linearly, both stages are equal; the step
+   is then taken as two by Simpson's rule (`simpson`), whose weights resolve a fast linear part, and the estimate is the
    difference from one such step.
 2. A step with an error above the tolerance is repeated with a shorter length.
 3. The next length is that at which the error would be a little below the tolerance.
