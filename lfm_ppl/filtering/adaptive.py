@@ -3,7 +3,9 @@
 1. Where the fifth stage, which is the next step's first, replaces the fourth, Runge-Kutta's formula has order three.
    The difference of the two results, e = h (k_4 - k_5) / 6, estimates the error of a step at no cost, in the mean and
    in the covariance, in standard deviations. An exponential step predicts its end with order two as well; the estimate
-   is the difference of the two predictions.
+   is the difference of the two predictions. Where only the forces enter non-linearly, both stages are equal; the step
+   is then taken as two by Simpson's rule (`simpson`), whose weights resolve a fast linear part, and the estimate is the
+   difference from one such step.
 2. A step with an error above the tolerance is repeated with a shorter length.
 3. The next length is that at which the error would be a little below the tolerance.
 4. Attempts run in blocks; `jax.lax.cond` skips attempts and blocks after the end of the interval.
@@ -25,13 +27,14 @@ from lfm_ppl.filtering.dynamics import (
     DriftLinearization,
     Dynamics,
     covariance_of,
+    is_nonlinear_in_forces_only,
     linearize_drift,
     minimum_sd,
 )
 from lfm_ppl.filtering.exponential import exponential_step
 from lfm_ppl.filtering.intervals import EXPONENTIAL
 from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose
-from lfm_ppl.filtering.predict import identity_prediction
+from lfm_ppl.filtering.predict import identity_prediction, interval_factor, predict_interval
 from lfm_ppl.filtering.runge_kutta import FourthStage, runge_kutta_step
 from lfm_ppl.filtering.transition import IntegratingFactor, integrating_factor
 from lfm_ppl.model.state_space import Span
@@ -67,7 +70,7 @@ class _Position(NamedTuple):
         remaining: length of the interval that is left.
         trial: length of the next attempt.
         prediction: up to here.
-        stage: linearised dynamics here, the first stage of the next step; None for exponential steps.
+        stage: linearised dynamics here, the first stage of the next Runge-Kutta step; None for other steps.
     """
 
     remaining: jax.Array
@@ -94,7 +97,10 @@ def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float
     min_sd = minimum_sd(dynamics, factor_of_interval, span.time(), length, moments)
 
     is_exponential = dynamics.method == EXPONENTIAL
-    exponent = -1 / 3 if is_exponential else -1 / 4  # The estimated error of a step is of order h^3 or h^4.
+    is_quadrature = not is_exponential and is_nonlinear_in_forces_only(ssm, dynamics.rule)
+    is_runge_kutta = not (is_exponential or is_quadrature)
+    # The estimated error of a step is of order h^3, h^5 or h^4.
+    exponent = -1 / 3 if is_exponential else -1 / 5 if is_quadrature else -1 / 4
 
     def linearize_at(t: jax.Array, moments: Moments) -> DriftLinearization:
         return linearize_drift(dynamics, t, moments.mean, covariance_of(moments), min_sd)
@@ -115,6 +121,8 @@ def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float
             step, step_error = exponential_step(dynamics, rest_of_span, h, previous.moments, min_sd_of_step)
             assert step_error is not None
             mean_error, covariance_error = step_error
+        elif is_quadrature:
+            step, mean_error, covariance_error = _simpson_step(dynamics, rest_of_span, h, previous.moments, record)
         else:
             assert position.stage is not None
             factor = integrating_factor(ssm, dynamics.linear, h)
@@ -150,11 +158,24 @@ def predict_interval_adaptively(dynamics: Dynamics, steps: int, tolerance: float
     is_finite = jnp.isfinite(moments.mean).all() & jnp.isfinite(moments.covariance).all()
     start = _Position(jnp.where(is_finite, length, 0.0), stop(_INITIAL_FRACTION * length),
                       identity_prediction(dynamics, moments, Record.SMOOTHER if has_map else Record.LIKELIHOOD),
-                      None if is_exponential else linearize_at(span.time(), moments))
+                      linearize_at(span.time(), moments) if is_runge_kutta else None)
     body = jax.checkpoint(unless_finished(block), prevent_cse=False)
     end, _ = jax.lax.scan(body, start, None, length=-(-_ATTEMPTS_PER_STEP * steps // _BLOCK))
     reached = jax.tree.map(lambda a: jnp.where(end.remaining > 0, jnp.nan, a), end.prediction.moments)
     return end.prediction._replace(moments=reached)
+
+
+def _simpson_step(dynamics: Dynamics, span: Span, h: jax.Array, moments: Moments,
+                  record: Record) -> tuple[Prediction, jax.Array, jax.Array]:
+    """Return the prediction in two steps by Simpson's rule, and its difference (M,), (M, n) from that in one."""
+    def predict(steps: int, record: Record) -> Prediction:
+        factor = interval_factor(dynamics.ssm, dynamics.rule, dynamics.linear, h, steps)
+        return predict_interval(dynamics, factor, steps, span, h, moments, record=record)
+
+    fine, coarse = predict(2, record), predict(1, Record.LIKELIHOOD)
+    size = dynamics.ssm.physical_dim
+    error = jax.tree.map(lambda a, b: (a - b)[:size], fine.moments, coarse.moments)
+    return fine, error.mean, error.covariance
 
 
 def _runge_kutta_error(h: jax.Array, end: Moments, stage4: FourthStage,
@@ -173,15 +194,15 @@ def _linear_part_error(dynamics: Dynamics, factor: IntegratingFactor, h: jax.Arr
                        stage1: DriftLinearization) -> tuple[jax.Array, jax.Array]:
     """Return the errors of the mean (M,) and the covariance (M, n) due to a fast linear part.
 
-    The step replaces the integral of exp(A s) r ds, of the rest r of the dynamics, by Simpson's rule W r. Its error e
-    obeys A e = A W r - (exp(A h) - 1) r, and each row of e is about that over the state's own rate. The noise D obeys
-    the same with A D + D A'.
+    The step replaces the integral of exp(A s) r ds, of the remainder r of the dynamics, by Simpson's rule W r. Its
+    error e obeys A e = A W r - (exp(A h) - 1) r, and each row of e is about that over the state's own rate. The noise D
+    obeys the same with A D + D A'.
     """
     size = dynamics.ssm.physical_dim
     matrix = dynamics.linear.rows[:, :size]
     full, half, identity = factor.full[:size, :size], factor.half[:size, :size], jnp.eye(size)
-    rest = jnp.concatenate([matmul(stage1.jacobian, start.covariance), stage1.remainder[:, None]], axis=1)
-    residual = matmul(h / 6 * matmul(matrix, full + 4.0 * half + identity) - (full - identity), rest)
+    remainder = jnp.concatenate([matmul(stage1.jacobian, start.covariance), stage1.remainder[:, None]], axis=1)
+    residual = matmul(h / 6 * matmul(matrix, full + 4.0 * half + identity) - (full - identity), remainder)
     rate = jnp.abs(diagonal(matrix))
     error = residual / (rate + 1.0 / h)[:, None]
     covariance = error[:, :-1].at[:, :size].add(error[:, :size].T)

@@ -37,7 +37,6 @@ _NEGATIVE = 1e-8
 _HUGE = 1e6
 """Growth of a standard deviation within a row, or size of it, above which the message mentions it."""
 
-
 _LARGEST_CHANGE = 1.0
 """Change of a smoothed mean in the last iteration, in standard deviations, above which iterations have not settled."""
 

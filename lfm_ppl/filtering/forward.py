@@ -253,7 +253,9 @@ def maps_about(problem: FilterProblem, points: LinearizationPoints | None) -> In
     """Return the affine maps of all intervals of a model that is linearised about given points.
 
     They are None for a time-invariant model or adaptive steps, whose passes compute them at no cost or need the moments
-    for them. A linear model is linearised about no points.
+    for them. A linear model with constant coefficients, but a dispersion that varies with time, has maps: only its
+    transition is tabulated, while the noise is integrated anew in each pass. A linear model is linearised about no
+    points.
     """
     ssm, rule, grid, _ = problem
     if ssm.time_invariant or grid.tolerance is not None:

@@ -89,7 +89,7 @@ class LongStep(NamedTuple):
         state: index of the state that decays.
         rate: of its decay.
         step: length of the step.
-        largest: largest product of step and rate in all rows.
+        largest: largest product of step and rate in all rows of all series.
         is_linear: whether the decay is one of the linear part.
     """
 
@@ -200,11 +200,10 @@ def long_step(steps: ExplicitSteps) -> LongStep | None:
     arrays = ExplicitSteps(*(np.asarray(a) for a in steps))
     if arrays.step.ndim == 1:
         return _long_step_of_series(arrays)
-    for series in range(len(arrays.step)):
-        long = _long_step_of_series(ExplicitSteps(*(a[series] for a in arrays)))
-        if long is not None:
-            return long._replace(series=series)
-    return None
+    long_steps = [long._replace(series=series) for series in range(len(arrays.step))
+                  if (long := _long_step_of_series(ExplicitSteps(*(a[series] for a in arrays)))) is not None]
+    # The number of steps is one for all series.
+    return long_steps[0]._replace(largest=max(long.largest for long in long_steps)) if long_steps else None
 
 
 def _long_step_of_series(steps: ExplicitSteps) -> LongStep | None:
@@ -257,7 +256,8 @@ def _participations(matrix: np.ndarray) -> np.ndarray:
     return products / np.maximum(products.sum(axis=0), 1e-300)
 
 
-def long_step_message(long: LongStep, state_names: tuple[str, ...], steps: int, has_method: bool = True) -> str:
+def long_step_message(long: LongStep, state_names: tuple[str, ...], steps: int, has_method: bool = True,
+                      regime_names: tuple[str, ...] = ()) -> str:
     """Return a sentence on a step that is too long, with the remedy.
 
     Args:
@@ -265,8 +265,11 @@ def long_step_message(long: LongStep, state_names: tuple[str, ...], steps: int, 
         state_names: names of the states.
         steps: integration steps between two consecutive times.
         has_method: whether the likelihood has a ``method``.
+        regime_names: names of the regimes, where the series of ``long`` are regimes.
     """
-    series = "" if long.series is None else f"series {long.series}, "
+    series = ""
+    if long.series is not None:
+        series = f"regime {regime_names[long.series]!r}, " if regime_names else f"series {long.series}, "
     row = "after the last row" if long.row is None else f"row {long.row}"
     product = long.rate * long.step
     consequence = (f"the level at which it settles is off by {100 * _simpson_error(product):.2g}%" if long.is_linear

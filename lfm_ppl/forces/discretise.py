@@ -221,13 +221,13 @@ def double(
 def repeat(function: Callable[..., tuple], values: tuple, count: jax.Array, most: int) -> Any:
     """Apply ``values = function(*values)`` a number of times that may be traced.
 
+    Applications, and blocks of them, that no problem needs are skipped, also under ``jax.vmap``.
+
     Args:
         function: from arrays to arrays of the same shapes.
         values: the arrays before the first application.
         count: how often it is applied, a whole number; of many problems at once with the shape of the last axes.
         most: static bound on ``count``.
-
-    Applications, and blocks of them, that no problem needs are skipped, also under ``jax.vmap``.
     """
 
     def unless_finished(body: Callable[[tuple, jax.Array], tuple]) -> Callable[[tuple, jax.Array], tuple[tuple, None]]:
@@ -351,10 +351,18 @@ def _as_arrays(*values):
     return tuple(jnp.asarray(value, dtype) for value in values)
 
 
-def substep_series(feedback, dt):
-    """Return the terms ``(F h)^k / k!`` of the power series on the substep, the substep h and the doublings s."""
+def substep_series(feedback: jax.Array, dt: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Divide a step into ``2^s`` substeps on which the power series of the transition converges.
+
+    Args:
+        feedback: ``F`` (n, n), in 1/time.
+        dt: length of the step, a scalar.
+
+    Returns:
+        Terms ``(F h)^k / k!`` (K, n, n), k = 0, 1, ..., the substep h and the number s of doublings.
+    """
     doublings = doublings_for(_growth(jax.lax.stop_gradient(feedback * dt)))
-    step = dt * jnp.exp2(-doublings)
+    step = jnp.exp2(-doublings) * dt
     return _power_series(feedback * step), step, doublings
 
 

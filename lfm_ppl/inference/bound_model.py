@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from numpyro.infer import init_to_median
 
-from lfm_ppl.filtering.breakdown import warn_of_iterations
+from lfm_ppl.filtering.breakdown import FilterWarning, warn_of_iterations
 from lfm_ppl.filtering.filter import FilterResult
 from lfm_ppl.filtering.smoother import SmootherResult
+from lfm_ppl.filtering.stiffness import ExplicitSteps, long_step, long_step_message
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood, single_site
@@ -400,6 +401,9 @@ class BoundModel:
 
         Raises:
             ValueError: the model is a panel, whose series are filtered one by one.
+
+        Warns:
+            FilterWarning: a step is too long for a fast decay, as in `lfm_ppl.filter`.
         """
         self._check_single("filter")
 
@@ -407,7 +411,9 @@ class BoundModel:
             site = self._site_at(z, y)
             return site.distribution.filter(site.observed)
 
-        return self.program("filter", lambda: Program(run))(_as_arrays(z), self._arguments(y))
+        result = self.program("filter", lambda: Program(run))(_as_arrays(z), self._arguments(y))
+        self._warn_of_long_steps(result.log_likelihood, z, y)
+        return result
 
     def smooth(self, z: ArrayLike | Mapping[str, Any], at: ArrayLike | None = None,
                y: ArrayLike | None = None) -> SmootherResult:
@@ -422,25 +428,54 @@ class BoundModel:
             ValueError: the model is a panel, whose series are smoothed one by one.
 
         Warns:
-            FilterWarning: the iterations have not settled, as in `lfm_ppl.smooth`.
+            FilterWarning: the iterations have not settled, or a step is too long for a fast decay, as in
+                `lfm_ppl.smooth`.
         """
         self._check_single("smooth")
         checks.refuse_dates("at", at)
-        times = None if at is None else np.atleast_1d(np.asarray(at, float))
-
-        def run(z: Any, y: Any) -> SmootherResult:
-            site = self._site_at(z, y)
-            return site.distribution.smooth(site.observed, times)
-
-        if times is None:
-            result = self.program("smooth", lambda: Program(run))(_as_arrays(z), self._arguments(y))
-        else:
-            data = self._all_data(y)
-            result = self.compiled(("smooth", signature(times)), lambda: Program(run))(
-                _as_arrays(z), None if self.argument is None else data)
+        result = self._run_at("smooth", lambda site, times: site.distribution.smooth(site.observed, times), z, y, at)
         if isinstance(result, SmootherResult) and not self.site.example.is_family:
             warn_of_iterations(result.change, result.log_likelihood_change)
+        self._warn_of_long_steps(result.log_likelihood, z, y, at)
         return result
+
+    def explicit_steps(self, z: Any, y: Any = None, at: Any = None) -> ExplicitSteps:
+        """Return what limits the explicit steps of the filter; series of a panel, or regimes, are a leading axis.
+
+        Args:
+            z: (d,), or site name -> value.
+            y: as in `log_density`.
+            at: (K,) requested times of a single series; None: the times of the data.
+        """
+        def steps(site: LikelihoodSite, times: Any) -> Any:
+            if isinstance(site.distribution, Panel):
+                return site.distribution.mapped(lambda series, y: series.explicit_steps(y), site.observed)
+            return site.distribution.explicit_steps(site.observed, times)
+
+        return self._run_at("explicit steps", steps, z, y, at)
+
+    def _run_at(self, name: str, function: Callable[[LikelihoodSite, Any], Any], z: Any, y: Any, at: Any) -> Any:
+        """Return a compiled function of the likelihood site at z and requested times (K,); None: those of the data."""
+        times = None if at is None else np.atleast_1d(np.asarray(at, float))
+
+        def run(z: Any, y: Any) -> Any:
+            return function(self._site_at(z, y), times)
+
+        if times is None:
+            return self.program(name, lambda: Program(run))(_as_arrays(z), self._arguments(y))
+        data = self._all_data(y)
+        return self.compiled((name, signature(times)), lambda: Program(run))(
+            _as_arrays(z), None if self.argument is None else data)
+
+    def _warn_of_long_steps(self, log_likelihood: Any, z: Any, y: Any, at: Any = None) -> None:
+        """Warn where a step is too long for a fast decay; nothing happens in compiled code."""
+        example = self.site.example
+        if checks.traced(log_likelihood) or not example.has_explicit_steps or not np.isfinite(log_likelihood).all():
+            return
+        long = long_step(self.explicit_steps(z, y, at))
+        if long is not None:
+            checks.warn(long_step_message(long, example.ssm.model.state_names, example.steps,
+                                          "method" in example.settings, example.regime_names), FilterWarning)
 
     def _check_single(self, name: str) -> None:
         if isinstance(self.site.distribution, Panel):

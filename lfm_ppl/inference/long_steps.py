@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.stiffness import ExplicitSteps, has_explicit_steps, long_step, long_step_message
+from lfm_ppl.filtering.stiffness import long_step, long_step_message
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.map_draws import map_series
-from lfm_ppl.utils.programs import Program
 
 
 def long_step_messages(bound: BoundModel, z: np.ndarray, has_method: bool = True) -> list[str]:
@@ -25,18 +19,9 @@ def long_step_messages(bound: BoundModel, z: np.ndarray, has_method: bool = True
     messages = []
     for name, site_model in bound.site_models.items():
         example = site_model.site.example
-        if len(example.ssms) > 1 or not has_explicit_steps(example.ssm, example.rule, example.time_grid):
-            continue
-        long = long_step(_explicit_steps(site_model, z))
+        long = long_step(site_model.explicit_steps(z)) if example.has_explicit_steps else None
         if long is not None:
             message = long_step_message(long, example.ssm.model.state_names, example.steps,
-                                        has_method and "method" in example.settings)
+                                        has_method and "method" in example.settings, example.regime_names)
             messages.append(f"site {name!r}: {message}" if bound.is_by_site else message)
     return messages
-
-
-def _explicit_steps(bound: BoundModel, z: np.ndarray) -> ExplicitSteps:
-    def run(z: jax.Array, y: Any) -> Any:
-        return map_series(bound.likelihood(z, y), lambda series, y: series.explicit_steps(y), bound.data(y))
-
-    return bound.program("explicit steps", lambda: Program(run))(jnp.asarray(z, float), bound.arguments)

@@ -34,7 +34,7 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.simulate import SimulationProgram, input_breakpoints
-from lfm_ppl.model.stiff_simulation import divide_steps
+from lfm_ppl.model.stiff_simulation import divide_steps, warn_of_infinite_states
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
 
@@ -223,8 +223,14 @@ class MarginalLikelihood(SeriesLikelihood):
         """Simulate the real model: (*sample_shape, T, D).
 
         No step is longer than a fifth of the longest step of the filter. Outside of compiled code, fast rates divide
-        the steps further, as in `lfm_ppl.simulate`.
+        the steps further, and a state that is not finite is a warning, as in `lfm_ppl.simulate`.
         """
+        state, y = self.simulate(key, sample_shape)
+        warn_of_infinite_states(state, self.times, self.model.state_names)
+        return y
+
+    def simulate(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> tuple[jax.Array, jax.Array]:
+        """Return physical states (*sample_shape, T, M) and observations (*sample_shape, T, D); see `sample`."""
         initial_time, times = self.time_grid.initial_time, checks.concrete(self.times)
         steps, breakpoints = SIMULATION_STEPS * self.steps, input_breakpoints(self.model, times, initial_time)
         program = SimulationProgram(self.ssm, steps, breakpoints, self.method == EXPONENTIAL)
@@ -235,11 +241,11 @@ class MarginalLikelihood(SeriesLikelihood):
                 program = replace(program, breakpoints=divide_steps(times, initial_time, steps, breakpoints, longest))
             program = program.resolved(times, float(initial_time))
 
-        def simulate(key: jax.Array) -> jax.Array:
+        def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
             simulation, _ = program.run(key, jnp.asarray(self.times, float), jnp.asarray(initial_time, float))
-            return simulation.y
+            return simulation.state, simulation.y
 
-        return repeat_draw(simulate, key, sample_shape)
+        return repeat_draw(draw, key, sample_shape)
 
 
 def _check_model(model: Any) -> None:

@@ -152,8 +152,8 @@ def _steps_per_interval(ssm: StateSpaceModel, times: Any, requested_times: Any, 
     # A row after the last observation is compared with the usual distance between two observations.
     index = np.searchsorted(marks, end - 1e-12 * np.abs(end), side="left") - 1
     gap = np.where(index < len(gaps), gaps[np.clip(index, 0, len(gaps) - 1)], np.median(gaps))
-    needed = (rows.length / np.minimum(gap / steps, longest))[end > first].max(initial=0.0)
-    return max(1, int(np.ceil(min(float(needed), _MOST_STEPS_OF_ROW * steps) - 1e-9)))
+    step_count = (rows.length / np.minimum(gap / steps, longest))[end > first].max(initial=0.0)
+    return max(1, int(np.ceil(min(float(step_count), _MOST_STEPS_OF_ROW * steps) - 1e-9)))
 
 
 def _longest_step(series: SeriesLikelihood, times: np.ndarray) -> float:

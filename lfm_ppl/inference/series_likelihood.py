@@ -214,13 +214,31 @@ class SeriesLikelihood(dist.Distribution):
         warn_of_long_steps(self.ssm, self.rule, self.time_grid, self.steps, lambda: self._filter(y).filtered_mean,
                            log_likelihood)
 
-    def explicit_steps(self, y: jax.Array) -> ExplicitSteps | None:
-        """Return what limits the explicit steps of the filter of ``y`` (T, D); None where there are none."""
-        if not has_explicit_steps(self.ssm, self.rule, self.time_grid):
+    @property
+    def has_explicit_steps(self) -> bool:
+        """Whether a filter takes explicit steps of fixed length, see `lfm_ppl.filtering.stiffness`."""
+        return any(has_explicit_steps(ssm, self.rule, self.time_grid) for ssm in self.ssms)
+
+    def explicit_steps(self, y: jax.Array, at: Any = None) -> ExplicitSteps | None:
+        """Return what limits the explicit steps of the filter of ``y`` (T, D); None where there are none.
+
+        Several regimes are a leading axis. ``at`` (K,) are requested times as in `smooth`.
+        """
+        if not self.has_explicit_steps:
             return None
+        grid = self.smoother_grid(at)
         # Linearised at the mean: the rates need no more, and this compiles fastest.
-        result = filter_on(self.ssm, Taylor(), self.time_grid, y, jnp.asarray(self.times, float))
-        return explicit_steps(self.ssm, self.time_grid, result.filtered_mean)
+        result = filter_on(self.ssm, Taylor(), grid, y, jnp.asarray(self.times, float))
+        return explicit_steps(self.ssm, grid, result.filtered_mean)
+
+    def smoother_grid(self, at: Any = None, steps: int | None = None) -> TimeGrid:
+        """Return the time grid of `smooth`, with its arguments."""
+        if at is None and steps is None:
+            return self.time_grid
+        if isinstance(at, GridLayout):
+            return self.grid_of(at)
+        return build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at,
+                               tolerance=self.tolerance)._replace(method=self.method)
 
     def smooth(self, y: Any, at: Any = None, steps: int | None = None) -> SmootherResult:
         """Smooth with this distribution's settings, or with other ``steps``; see `lfm_ppl.smooth`.
@@ -232,14 +250,7 @@ class SeriesLikelihood(dist.Distribution):
             at: (K,) requested times, or the result of `lay_out` for them; None: the times of the data.
             steps: integration steps between two consecutive times; None: `steps` of the distribution.
         """
-        if at is None and steps is None:
-            grid = self.time_grid
-        elif isinstance(at, GridLayout):
-            grid = self.grid_of(at)
-        else:
-            grid = build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at,
-                                   tolerance=self.tolerance)._replace(method=self.method)
-        y = self.checked(y)
+        grid, y = self.smoother_grid(at, steps), self.checked(y)
         result = smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
         if not self.is_family:
             warn_of_iterations(result.change, result.log_likelihood_change)
@@ -329,9 +340,9 @@ def refuse_times_by_site(times: Any) -> None:
                         f"{', '.join(map(str, times)) or 'none'}: write times[{name!r}], and obs=y[{name!r}].")
 
 
-def repeat_draw(draw: Callable[[jax.Array], jax.Array], key: jax.Array, sample_shape: tuple[int, ...]) -> jax.Array:
-    """Return independent draws (*sample_shape, ...) of ``draw(key)``; one draw where the shape is empty."""
+def repeat_draw(draw: Callable[[jax.Array], Any], key: jax.Array, sample_shape: tuple[int, ...]) -> Any:
+    """Return independent draws (*sample_shape, ...) of the arrays ``draw(key)``; one draw where the shape is empty."""
     if not sample_shape:
         return draw(key)
     draws = jax.vmap(draw)(jax.random.split(key, int(np.prod(sample_shape))))
-    return draws.reshape(*sample_shape, *draws.shape[1:])
+    return jax.tree.map(lambda a: a.reshape(*sample_shape, *a.shape[1:]), draws)

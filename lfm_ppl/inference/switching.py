@@ -25,13 +25,20 @@ from lfm_ppl.filtering.breakdown import FilterWarning
 from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid, with_state_maps
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
-from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.filtering.stiffness import (
+    ExplicitSteps,
+    explicit_steps,
+    has_explicit_steps,
+    long_step,
+    long_step_message,
+)
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
+from lfm_ppl.model.stiff_simulation import warn_of_infinite_states
 from lfm_ppl.particles.stochastic_steps import choose_scheme
 from lfm_ppl.switching.chain import MarkovChain, check_probabilities, check_rates, transition_matrices
 from lfm_ppl.switching.regime_model import check_models, joint_model
@@ -103,7 +110,8 @@ class Switching(SeriesLikelihood):
             `lfm_ppl.filter`. In compiled code a failure is a log density of -inf.
 
     Warns:
-        FilterWarning: outside of compiled code, where the log density is -inf: the first row at which it is.
+        FilterWarning: outside of compiled code, where the log density is -inf: the first row at which it is; where an
+            explicit step of a regime is too long for a fast decay: which regime, state and row, and the remedy.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
@@ -149,7 +157,11 @@ class Switching(SeriesLikelihood):
         return {name: getattr(self, name) for name in ("rule", "steps", "max_step", "initial", "merging", "method")}
 
     def with_settings(self, **settings: Any) -> Switching:
-        """Return the same distribution with another ``rule``, ``steps``, ``max_step`` or ``method``."""
+        """Return the same distribution with another ``rule``, ``steps``, ``max_step`` or ``method``.
+
+        They are the numerics of each regime. ``merging`` is none: it is the approximation itself, with the number of
+        filters, as ``initial`` is a part of the model. For another one construct the distribution again.
+        """
         names = ("rule", "steps", "max_step", "method")
         for name in settings:
             if name not in names:
@@ -184,7 +196,38 @@ class Switching(SeriesLikelihood):
         log_likelihood = finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y)
         if checks.concrete(log_likelihood) == -np.inf:
             checks.warn(self.breakdown(y), FilterWarning)
+        self._warn_of_long_steps(self.time_grid, self.steps, y, log_likelihood)
         return log_likelihood
+
+    def explicit_steps(self, y: jax.Array, at: Any = None) -> ExplicitSteps | None:
+        """Return what limits the explicit steps of each of the regimes (K, ...); None where there are none.
+
+        Each regime is followed from the filtered means, merged over all regimes.
+        """
+        return self._explicit_steps_on(self.smoother_grid(at), y) if self.has_explicit_steps else None
+
+    def _explicit_steps_on(self, grid: TimeGrid, y: jax.Array) -> ExplicitSteps:
+        probability, moments, _ = filter_regimes(self.regimes(grid), y).filtered
+        mean = jnp.einsum("nkm,nkmi->ni", probability, moments.mean)[jnp.asarray(grid.observed)]
+        steps = []
+        for ssm in self.ssms:
+            limits = explicit_steps(ssm, grid, mean)
+            # A regime that is integrated exactly has no step.
+            is_explicit = has_explicit_steps(ssm, self.rule, grid)
+            steps.append(limits if is_explicit else limits._replace(step=jnp.zeros_like(limits.step)))
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *steps)
+
+    def _warn_of_long_steps(self, grid: TimeGrid, steps: int, y: jax.Array, log_likelihood: jax.Array) -> None:
+        """Warn where a step of a regime is too long for a fast decay, outside of compiled code; y (T, D) is checked."""
+        if checks.traced((self.models, self.rates, log_likelihood)) or not self.has_explicit_steps:
+            return
+        if not np.isfinite(np.asarray(log_likelihood)).all():
+            return
+        # One program: eager operations take longer to compile, one by one.
+        long = long_step(jax.jit(lambda y: self._explicit_steps_on(grid, y))(y))
+        if long is not None:
+            checks.warn(long_step_message(long, self.models[0].state_names, steps, regime_names=self.regime_names),
+                        FilterWarning)
 
     def breakdown(self, y: jax.Array) -> str:
         """Return a sentence on the first row at which the density is not finite."""
@@ -219,9 +262,11 @@ class Switching(SeriesLikelihood):
             steps: integration steps between two consecutive times; None: the number of the distribution.
         """
         y = self.checked(y)
-        grid = self.time_grid if at is None and steps is None else self._grid(at, steps)
+        grid = self.smoother_grid(at, steps)
         # One program: eager operations take longer to compile, one by one.
-        return jax.jit(lambda y: self._smooth(y, grid))(y)
+        result = jax.jit(lambda y: self._smooth(y, grid))(y)
+        self._warn_of_long_steps(grid, self.steps if steps is None else steps, y, result.log_likelihood)
+        return result
 
     def _smooth(self, y: jax.Array, grid: TimeGrid) -> RegimeSmootherResult:
         regimes, requested = self.regimes(grid), jnp.asarray(grid.requested)
@@ -251,13 +296,9 @@ class Switching(SeriesLikelihood):
         return {"leave_one_out": left_out[observed], "one_step_ahead": trace.log_likelihood[observed],
                 "residual": trace.residual[observed]}
 
-    def _grid(self, at: Any, steps: int | None = None) -> TimeGrid:
-        steps = self.steps if steps is None else steps
-        return build_time_grid(self.ssm, self.times, steps, self.max_step, at)._replace(method=self.method)
-
     def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
         """Draw a trajectory given the data, whose state is (x, indicators of the regimes); see the base class."""
-        grid = self.time_grid if at is None else self._grid(at)
+        grid = self.smoother_grid(at)
         regimes, requested = self.regimes(grid), jnp.asarray(grid.requested)
         path_key, state_key = jax.random.split(key)
         path = sample_regimes(path_key, regimes, filter_regimes(regimes, y), y, 1)[0][:, 0]
@@ -267,14 +308,20 @@ class Switching(SeriesLikelihood):
         return self._with_indicators(candidates[indices, jnp.arange(len(times))], indices), times
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
-        """Simulate the real model: (*sample_shape, T, D)."""
-        return repeat_draw(lambda key: self.simulate(key)[1], key, sample_shape)
+        """Simulate the real model: (*sample_shape, T, D).
+
+        Outside of compiled code, a state that is not finite is a warning, as in `lfm_ppl.simulate`.
+        """
+        inputs, y = repeat_draw(self.simulate, key, sample_shape)
+        state_names = self.models[0].state_names
+        warn_of_infinite_states(inputs[..., :len(state_names)], self.times, state_names)
+        return y
 
     def simulate(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Simulate the real model: (x, indicators of the regimes, u) (T, M + K + R), and observations (T, D)."""
         ssms, times = self.ssms, np.asarray(self.times, float)
         initial_key, path_key = jax.random.split(key)
-        grid = with_state_maps(ssms[0], self._grid(None, SIMULATION_STEPS * self.steps))
+        grid = with_state_maps(ssms[0], self.smoother_grid(None, SIMULATION_STEPS * self.steps))
         distinct = np.unique(times)
         # The decision at the last time has no consequences.
         chain = MarkovChain(distinct, transition_matrices(self.rates, jnp.diff(distinct, append=distinct[-1])))

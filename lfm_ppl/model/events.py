@@ -152,15 +152,17 @@ class Infusion(Event):
 
     Args:
         times: (K,), starts, in any order; not before the initial time of the model. They may be traced.
-        amounts: d_k (K,), or one number for all; they may be parameters.
+        amounts: d_k (K,), or one number for all; they may be parameters. A negative amount is removed, as by a `Dose`;
+            it needs ``duration``. Where an amount is zero, nothing is infused.
         target: name of the state that receives the amounts, or the direction b (M,).
         rate: amount in a unit of time, (K,) or one number for all; either it or ``duration`` is given.
         duration: T_k, (K,) or one number for all.
         lag: delay of all infusions, or of each one (K,); it may be a parameter.
 
     Raises:
-        ValueError, TypeError: numbers that are not finite, a rate or duration that is not positive, or shapes that
-            disagree. In compiled code a duration that is not positive is a log density of -inf.
+        ValueError, TypeError: numbers that are not finite, a rate or duration that is not positive, a negative amount
+            with ``rate``, or shapes that disagree. In compiled code a duration that is not positive is a log density
+            of -inf.
 
     Example:
         >>> import jax.numpy as jnp, numpy as np, lfm_ppl as lfm
@@ -196,6 +198,9 @@ class Infusion(Event):
         is_positive = value > 0
         divisor = jnp.where(is_positive, value, 1.0) if checks.traced(value) else value
         quotient = self.values / divisor
+        if rate is not None and not checks.traced(quotient) and np.any(quotient < 0):
+            raise ValueError(f"amounts of an infusion with rate= must not be negative, got {np.min(self.values):g}: "
+                             "the infusion would end before it starts. Use duration= for amounts that are removed.")
         if rate is None:
             self.rates, self.durations = quotient, value
         else:

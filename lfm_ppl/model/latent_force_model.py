@@ -278,12 +278,9 @@ class LatentForceModel(eqx.Module):
     def input_reads(self, first: float, last: float) -> list[InputRead]:
         """Return the reads of known inputs between observations, see `lfm_ppl.model.inputs.input_reads`."""
         functions = _integrated_functions(self.traced_functions()) if self._has_integrated_inputs else []
-        # Inside of compiled code arithmetic on JAX arrays would give tracers.
-        def concrete(part: Any) -> Any:
-            return part if checks.traced(part) else np.asarray(part)
-
         return input_reads(functions, first, last) + [
-            InputRead("previous", concrete(rate.times), concrete(rate.values), 1.0, 0.0) for _, rate in self.infusions]
+            InputRead("previous", _concrete(rate.times), _concrete(rate.values), 1.0, 0.0)
+            for _, rate in self.infusions]
 
     @property
     def has_quadratic_inputs(self) -> bool:
@@ -423,3 +420,8 @@ def _dispersion(value: Any, size: int) -> jax.Array | None:
         raise ValueError(f"process_noise must be a dispersion matrix ({size}, S), one row for each state, got shape "
                          f"{value.shape}. For independent noises use jnp.diag(standard_deviations).")
     return value
+
+
+def _concrete(values: Any) -> Any:
+    """Return a NumPy array unless a value is traced: arithmetic on JAX arrays gives tracers in compiled code."""
+    return values if checks.traced(values) else np.asarray(values)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
@@ -20,7 +21,7 @@ from lfm_ppl.model.user_functions import TracedFunction
 
 _SUMS = {"add", "sub", "add_any", "neg", "copy", "copy_p", "convert_element_type", "reduce_sum", "reshape", "squeeze",
          "broadcast_in_dim", "transpose", "rev", "slice", "concatenate", "pad", "stack", "unstack", "split", "tile",
-         "expand_dims", "reduce_precision", "stop_gradient"}
+         "expand_dims", "stop_gradient"}
 _PRODUCTS = {"mul", "dot_general"}
 _CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
@@ -59,6 +60,9 @@ def _apply(equation: Any, operands: list[float]) -> list[float]:
         *table, time = operands[-3:]
         is_affine = time == 1.0 and not any(table)
         return [{"previous": 0.0, "linear": 1.0}[interpolation] if is_affine else np.inf] * count
+    if name == "convert_element_type" and not jnp.issubdtype(equation.params["new_dtype"], jnp.inexact):
+        # Integers truncate and booleans compare with zero: a step function of time.
+        return [np.inf] * count
     if name in _SUMS:
         return [highest] * count
     if name in _PRODUCTS:

@@ -179,8 +179,9 @@ def fit_many(
 
     Data sets of equal shapes share the compiled programs of `fit` in each process, with individual times, known inputs
     and doses (`lfm.bind` names the exceptions), and the processes of one machine share a cache of compiled programs.
-    The result of a data set is that of `fit` with the seed
-    ``seed_of(name, seed)``, for any other data sets and any number of workers.
+    The result of a data set is that of `fit` with the seed ``seed_of(name, seed)``, for any other data sets and any
+    number of workers. The model, with all that it calls and reads, must not change while the results are iterated: a
+    program is compiled once, for the model as it is then.
 
     Args:
         numpyro_model: the model, as in `fit`.

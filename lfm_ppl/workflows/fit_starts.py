@@ -111,7 +111,7 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
     if laplace is not None:
         points = starting_points(options.keys["starts"], bound, laplace, options.chains)
         return ChainStart(nuts, points, {"warmup": warmup, "init": "laplace"}, mode=laplace.mode)
-    strategy = init_to_median if is_at_mode else _strategy(bound, options)
+    strategy = init_to_median if is_at_mode else _strategy(options)
     points = _starting_points(bound, options, strategy, nuts.evaluate)
     init = "strategy" if callable(options.init) else "median"
     return ChainStart(nuts, points, {"warmup": warmup, "init": init, **fallback})
@@ -124,14 +124,12 @@ def _find_random_walk_start(bound: BoundModel, options: FitOptions, setup: Mappi
         if isinstance(kernel, ParticleMarginalRAM):
             kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
         return _random_walk_start(bound, options, kernel, None)
-    strategy = _strategy(bound, options)
-    mode = None
-    if "initial_covariance" not in sampler_options:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            mode = mode_of(options.keys["mode"], bound, restarts=2)
-        if mode.unidentified or not np.all(np.isfinite(mode.covariance)):
-            mode = None
+    has_covariance = "initial_covariance" in sampler_options
+    mode = None if has_covariance and options.init != "map" else _find_mode(bound, options)
+    strategy = _strategy(options, mode)
+    # Without a usable covariance the mode is a starting point only.
+    if mode is not None and (has_covariance or mode.unidentified or not np.all(np.isfinite(mode.covariance))):
+        mode = None
     if mode is not None:
         sampler_options["initial_covariance"] = mode.covariance
         if options.sampler == "pmmh":
@@ -160,13 +158,20 @@ def _random_walk_start(bound: BoundModel, options: FitOptions, kernel: RAM, poin
     return ChainStart(particle_marginal_sampler(bound, num_warmup, kernel), points, attributes, particle_options)
 
 
-def _strategy(bound: BoundModel, options: FitOptions) -> Callable:
-    """Return the NumPyro strategy of ``init``."""
-    if options.init is None or isinstance(options.init, str) and options.init == "median":
-        return init_to_median
-    if isinstance(options.init, str):
-        return init_to_value(values=mode_of(options.keys["mode"], bound).parameters)
-    return options.init
+def _find_mode(bound: BoundModel, options: FitOptions) -> MAPResult:
+    """Return the posterior mode; its warnings concern chains that start there, and no mere proposal covariance."""
+    if options.init == "map":
+        return mode_of(options.keys["mode"], bound)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return mode_of(options.keys["mode"], bound, restarts=2)
+
+
+def _strategy(options: FitOptions, mode: MAPResult | None = None) -> Callable:
+    """Return the NumPyro strategy of ``init``, which is at ``mode`` for "map"."""
+    if callable(options.init):
+        return options.init
+    return init_to_value(values=mode.parameters) if options.init == "map" and mode is not None else init_to_median
 
 
 def _starting_points(bound: BoundModel, options: FitOptions, strategy: Callable, evaluate: Callable) -> np.ndarray:

@@ -51,6 +51,24 @@ def test_slow_and_stiff_models_are_integrated_to_the_tolerance(rule):
     assert np.all(tight < loose), "a smaller tolerance is more accurate for every model"
 
 
+@pytest.mark.slow
+def test_a_model_that_is_not_linear_in_its_force_only_is_integrated_to_the_tolerance():
+    """With a fast and a slow state; gradients in both modes."""
+    y, at = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]]), jnp.array([8.0, 8.0, 0.6])
+
+    def log_prob(parameters, tolerance, steps):
+        return expression(parameters, tolerance, steps, link=lambda u: jax.nn.sigmoid(3.0 * u)).log_prob(y)
+
+    exact, gradient = jax.jit(jax.value_and_grad(lambda p: log_prob(p, None, 400)))(at)
+    (loose, tight), reverse, forward = jax.jit(lambda p: (
+        (log_prob(p, 1e-1, 100), log_prob(p, 1e-5, 100)), jax.grad(log_prob)(p, 1e-5, 100),
+        jax.jacfwd(log_prob)(p, 1e-5, 100)))(at)
+    assert abs(tight - exact) < 1e-2
+    assert abs(tight - exact) < abs(loose - exact)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    np.testing.assert_allclose(reverse, gradient, rtol=1e-2)
+
+
 def test_gradients_are_those_of_the_exact_integration_in_both_modes():
     at = SLOW_TO_STIFF[0]
     adaptive = lambda p: double_well(p, lfm.Taylor(), tolerance=1e-5).log_prob(Y)  # noqa: E731

@@ -44,6 +44,16 @@ def test_overlapping_infusions_superpose_in_all_methods():
     np.testing.assert_allclose(particles, exact, atol=1e-9)
 
 
+def test_negative_amounts_are_removed_over_a_duration_and_refused_with_a_rate():
+    removed = decay([lfm.Infusion(STARTS, -AMOUNTS, "blood", duration=DURATIONS)])
+    np.testing.assert_allclose(lfm.filter(removed, TIMES, Y).predicted_mean[:, 0], -blood(TIMES), atol=1e-9)
+    for amounts, rate in ((-10.0, 2.0), ([4.0, -3.0, 2.0], [1.0, 2.0, 3.0])):
+        with pytest.raises(ValueError, match="amounts of an infusion with rate= must not be negative.*duration="):
+            lfm.Infusion(STARTS, amounts, "blood", rate=rate)
+    nothing = decay([lfm.Infusion(STARTS, [0.0, -0.0, 0.0], "blood", rate=2.0)])
+    np.testing.assert_array_equal(lfm.filter(nothing, TIMES, Y).predicted_mean, 0.0)
+
+
 def test_a_non_linear_model_integrates_an_infusion_between_its_ends():
     # In the logarithm of the rate of elimination the state of this model has a closed form: x' = r - x^2.
     model = decay([lfm.Infusion([1.0], 4.0, "blood", duration=2.0)], lambda x, u, t: -x**2)

@@ -14,6 +14,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering.stiffness import decay_rates
+from lfm_ppl.inference.long_steps import long_step_messages
 
 INFUSION = lfm.Input([0.0, 24.0], [10.0, 0.0], "previous", "hold")
 ROWS = np.array([6.0, 12.0, 24.0])
@@ -60,21 +61,25 @@ def test_likelihood_filter_smoother_and_panel_say_it_and_compiled_code_does_not(
         assert len(messages(call)[1]) == 1
     said = messages(lambda: panel.log_prob(np.stack([Y, Y])))[1]
     assert len(said) == 1 and "series 1, row 0" in said[0]
+    bound = lfm.bind(stiff_model, ROWS, Y)
+    for call in (bound.filter, bound.smooth, lambda z: bound.smooth({"rate": 10.0}, at=[3.0])):
+        said = messages(lambda call=call: call(np.log([10.0])))[1]
+        assert len(said) == 1 and "'drug'" in said[0] and "row 0" in said[0]
+    assert not messages(lambda: bound.filter(np.log([0.1])))[1]
+    assert not messages(lambda: jax.jit(lambda z: bound.filter(z).log_likelihood)(np.log([10.0])))[1]
     assert not messages(lambda: jax.jit(lambda rate: lfm.filter(elimination(rate), ROWS, Y).log_likelihood)(10.0))[1]
 
 
 @pytest.mark.parametrize("rate", [30.0, pytest.param(300.0, marks=pytest.mark.slow)])
-def test_a_fast_linear_decay_to_a_function_of_a_force(rate):
+def test_a_fast_linear_decay_to_a_function_of_a_force_needs_no_remedy(rate):
     model = lfm.LatentForceModel(
         lambda x, u, t: rate * (jax.nn.softplus(u) - x), {"u": lfm.Matern(1e-4, 5.0, mean=3.0)}, NOISE,
         lfm.Gaussian(jnp.array([3.0486]), 1e-6 * jnp.eye(1)), state_names=("sensor",), initial_time=0.0)
     times, y = np.arange(1.0, 6.0), np.full((5, 1), 3.0486)
-    result, said = messages(lambda: lfm.filter(model, times, y))
-    assert abs(result.predicted_mean[-1, 0] - 3.0486) > 0.05
-    assert len(said) == 1 and "'sensor'" in said[0] and "off by" in said[0]
-    result, said = messages(lambda: lfm.filter(model, times, y, steps=proposed_steps(said[0])))
-    np.testing.assert_allclose(result.predicted_mean[-1, 0], 3.0486, rtol=1e-3)
-    assert not said
+    for settings in ({}, {"tolerance": 1e-3}, {"method": "exponential"}):
+        result, said = messages(lambda settings=settings: lfm.filter(model, times, y, **settings))
+        np.testing.assert_allclose(result.predicted_mean[:, 0], 3.0486, rtol=1e-3)
+        assert not said
 
 
 def test_a_tolerance_resolves_a_fast_linear_part():
@@ -111,10 +116,52 @@ def test_a_dose_that_makes_a_decay_fast():
     assert len(said) == 1 and "'substrate'" in said[0] and "row 1" in said[0]
 
 
-def test_a_fit_says_it_before_it_samples():
+def stiff_model(times, y=None):
+    rate = numpyro.sample("rate", dist.LogNormal(np.log(10.0), 1e-3))
+    numpyro.sample("y", lfm.MarginalLikelihood(elimination(rate), times, iterations=0), obs=y)
+
+
+def test_a_panel_proposes_steps_for_its_fastest_series():
+    panel = lfm.panel(elimination, jnp.array([1.0, 10.0, 40.0]), ROWS, iterations=0)
+    y = np.stack([Y] * 3)
+    said = messages(lambda: panel.log_prob(y))[1]
+    assert len(said) == 1 and "series 1, row 0" in said[0]
+    enough = lfm.panel(elimination, jnp.array([1.0, 10.0, 40.0]), ROWS, iterations=0, steps=proposed_steps(said[0]))
+    assert not messages(lambda: enough.log_prob(y))[1]
+
+
+def switching(rate, times=ROWS):
+    """A linear regime, which is exact at any rate, and one that is integrated."""
+    models = {"exact": system(lambda x, u, t: INFUSION(t) - 300.0 * x, [0.0], ("drug",)), "fast": elimination(rate)}
+    return lfm.Switching(models, 0.1 * (1.0 - np.eye(2)), times)
+
+
+def test_regimes_are_named():
+    likelihood = switching(10.0)
+    said = messages(lambda: likelihood.log_prob(Y))[1]
+    assert len(said) == 1 and "'drug'" in said[0] and "at regime 'fast', row 0" in said[0]
+    enough = likelihood.with_settings(steps=proposed_steps(said[0]))
+    assert not messages(lambda: enough.log_prob(Y))[1]
+
+
+@pytest.mark.slow
+def test_regimes_are_named_by_the_smoother_and_before_a_fit():
+    likelihood = switching(10.0)
+    for call in (likelihood.smooth, lambda y: likelihood.smooth(y, at=[3.0])):
+        said = messages(lambda call=call: call(Y))[1]
+        assert len(said) == 1 and "at regime 'fast', row 0" in said[0]
+    assert not messages(lambda: likelihood.with_settings(method="exponential").log_prob(Y))[1]
+    assert not messages(lambda: jax.jit(likelihood.log_prob)(Y))[1]
+
     def model(times, y=None):
         rate = numpyro.sample("rate", dist.LogNormal(np.log(10.0), 1e-3))
-        numpyro.sample("y", lfm.MarginalLikelihood(elimination(rate), times, iterations=0), obs=y)
+        numpyro.sample("y", switching(rate, times), obs=y)
 
-    said = messages(lambda: lfm.fit(model, ROWS, Y, sampler="map", samples=2, trajectory_draws=0, progress=False))[1]
+    said = long_step_messages(lfm.bind(model, ROWS, Y), np.log([10.0]))
+    assert len(said) == 1 and "at regime 'fast', row 0" in said[0]
+
+
+def test_a_fit_says_it_before_it_samples():
+    said = messages(lambda: lfm.fit(stiff_model, ROWS, Y, sampler="map", samples=2, trajectory_draws=0,
+                                    progress=False))[1]
     assert len(said) == 1 and "'drug'" in said[0] and "row 0" in said[0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -139,5 +141,17 @@ def test_the_law_does_not_depend_on_the_requested_times():
 def test_what_is_not_finite_is_said():
     model = lfm.LatentForceModel(lambda x, u, t: x**2, {}, lfm.GaussianObservation(whole_state, jnp.ones(1)),
                                  lfm.Gaussian(jnp.ones(1), jnp.zeros((1, 1))), state_names=("x",), initial_time=0.0)
+    times, key = np.array([0.5, 2.0]), jax.random.key(0)
     with pytest.warns(UserWarning, match="'x' is not finite from time 2"):
-        lfm.simulate(jax.random.key(0), model, np.array([0.5, 2.0]))
+        lfm.simulate(key, model, times)
+    likelihood = lfm.MarginalLikelihood(model, times)
+    with pytest.warns(UserWarning, match="'x' is not finite from time 2 on, in 1 of 1 paths"):
+        likelihood.sample(key)
+    with pytest.warns(UserWarning, match="in 6 of 6 paths"):
+        likelihood.sample(key, (2, 3))
+    with pytest.warns(UserWarning, match="in 2 of 2 paths"):
+        lfm.Switching({"a": model, "b": model}, [[0.0, 1.0], [1.0, 0.0]], times).sample(key, (2,))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jax.jit(likelihood.sample)(key)
+        lfm.MarginalLikelihood(model, times[:1]).sample(key)

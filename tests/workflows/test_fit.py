@@ -1,6 +1,7 @@
 import functools
 import json
 import warnings
+from unittest.mock import Mock
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,8 @@ from scipy.interpolate import CubicSpline
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.layout import Labels, checked_truth, unplaced
+from lfm_ppl.workflows import fit_starts
+from lfm_ppl.workflows.fit_options import FitOptions
 from tests.inference import linear_motif as motif
 
 TIMES = motif.TIMES
@@ -390,6 +393,19 @@ def test_the_same_seed_gives_the_same_result(y):
         assert not group(other, name).equals(group(first, name))
     attrs = arviz_data.attributes(first)
     assert (attrs["model"], attrs["thin"]) == ("model", 15)  # five steps for each of three parameters
+
+
+@pytest.mark.parametrize("options", [{}, {"initial_covariance": 0.04 * np.eye(1)}])
+def test_a_random_walk_from_the_mode_searches_it_once(monkeypatch, y, options):
+    search = Mock(side_effect=fit_starts.mode_of)
+    monkeypatch.setattr(fit_starts, "mode_of", search)
+    bound = lfm.bind(one_parameter, TIMES, y)
+    start = fit_starts.find_start(bound, FitOptions("ram", 2, 5, 5, 1, 0, {}, None, 0, "map", options, "vectorized"),
+                                  None)
+    assert search.call_count == 1
+    np.testing.assert_allclose(bound.log_density_gradient(start.points[0])[1], 0.0, atol=1e-3)
+    np.testing.assert_array_equal(start.points[0], start.points[1])
+    assert (start.mode is None) == bool(options)
 
 
 def converted(times, y=None, start=None, max_step=None):

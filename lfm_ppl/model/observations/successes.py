@@ -101,15 +101,15 @@ class BinomialObservation(_TrialObservation):
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return log C(n, y) + y log p + (n - y) log(1 - p), (D,)."""
         (log_probability, log_complement), n = PROBABILITIES[self.link], self.total_count
-        others, is_mixed = n - y, (y > 0) & (y < n)
+        failure_count, is_mixed = n - y, (y > 0) & (y < n)
         trials, successes, failures = (jnp.where(is_mixed, number, default) for number, default in (
-            (n, 2.0), (y, 1.0), (others, 1.0)))
+            (n, 2.0), (y, 1.0), (failure_count, 1.0)))
         coefficient = (stirling_error(trials) - stirling_error(successes) - stirling_error(failures)
                        - 0.5 * (LOG_2PI + jnp.log(successes) + jnp.log(failures / trials)))
         # Shares of y / n and 1 - y / n are the reference, where the two deviances are zero.
         terms = [_log_power(log_p - jnp.log(jnp.where(is_mixed, share, 1.0)), number, is_mixed)
                  for log_p, share, number in ((log_probability(predictor), successes / trials, y),
-                                              (log_complement(predictor), failures / trials, others))]
+                                              (log_complement(predictor), failures / trials, failure_count))]
         return jnp.where(is_mixed, coefficient, 0.0) + terms[0] + terms[1]
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
