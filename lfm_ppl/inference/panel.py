@@ -30,6 +30,7 @@ from lfm_ppl.model.events import check_start, event_table
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import check_times
+from lfm_ppl.model.stiff_simulation import warn_of_infinite_states
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.batching import mapped
 from lfm_ppl.utils.programs import Program
@@ -160,11 +161,13 @@ class Panel(dist.Distribution):
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate every series: (*sample_shape, B, T, D)."""
 
-        def draw(key: jax.Array) -> jax.Array:
+        def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
             keys = jax.random.split(key, self.batch_shape[0])
-            return self.mapped(lambda series, key: series.sample(key), keys)
+            return self.mapped(lambda series, key: series.simulate(key), keys)
 
-        return repeat_draw(draw, key, sample_shape)
+        state, y = repeat_draw(draw, key, sample_shape)
+        warn_of_infinite_states(state, self.times, self.first.model.state_names)
+        return y
 
     def checked(self, value: Any) -> jax.Array:
         """Return ``value`` as an array (B, T, D) after checking it."""
