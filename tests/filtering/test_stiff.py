@@ -187,9 +187,3 @@ def test_a_tolerance_for_a_fast_state_that_follows_an_input(rate):
     linear_input = follower(rate, lfm.Input(hours, table, "linear", "hold"))
     result = lfm.filter(linear_input, times, np.zeros((12, 1)), method="exponential", tolerance=1e-3)
     np.testing.assert_allclose(result.predicted_mean[:, 0], exact, rtol=1e-8)
-
-
-def test_a_breakdown_of_a_linear_model_with_a_tolerance_names_steps():
-    model = follower(10.0, lambda t: 10 + 5 * jnp.sin(3000.0 * t))
-    with pytest.warns(lfm.FilterWarning, match=r"more steps.*tolerance"):
-        lfm.filter(model, np.array([1.0, 2.0]), np.zeros((2, 1)), method="exponential", tolerance=1e-3, steps=1)

@@ -67,7 +67,7 @@ def test_the_weight_of_the_prior_and_the_data_are_arguments_of_one_program(bound
             runs.append(value)
     assert len(set(runs)) == 4
     run = bound.compiled(("energy", ("decay", "amount"), True), lambda: None)
-    assert run._cache_size() == 1
+    assert len(run._own) == 1
 
 
 def test_the_filter_and_the_likelihood_take_what_the_site_observes(bound):

@@ -55,7 +55,8 @@ def test_a_group_that_collapses_is_named_everywhere(y, keywords, tmp_path):
     result = fitted(y * keywords.get("unit", 1.0), **keywords)
     table = arviz_data.summary(result)
     assert table.loc["spread", "mode"] < 1e-4
-    (message,) = json.loads(arviz_data.attributes(result)["warnings"])
+    message, *conflicts = json.loads(arviz_data.attributes(result)["warnings"])
+    assert all("spread" in conflict and "prior" in conflict for conflict in conflicts)
     assert message == arviz_data.convergence_warnings(result)[0]
     assert "spread" in message
     assert table["warnings"].to_dict() == {name: "degenerate mode" * (name == "spread") for name in table.index}

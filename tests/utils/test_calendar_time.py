@@ -238,7 +238,7 @@ def test_sites_have_the_unit_of_the_model_and_one_kind_of_clock():
     for zone in ("UTC", "Asia/Tokyo"):
         mixed = {"a": (pd.DatetimeIndex(DATES), y), "b": (pd.DatetimeIndex(DATES, tz=zone), y)}
         for order in (["a", "b"], ["b", "a"]):
-            with pytest.raises(ValueError, match="'b' have an offset from UTC, and those of 'a' have none"):
+            with pytest.raises(ValueError, match="'b' have an offset from UTC, and the times of 'a' have none"):
                 bind_sites(two_sites, {name: mixed[name] for name in order}, None)
 
 
