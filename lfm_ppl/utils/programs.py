@@ -22,10 +22,10 @@ import numpy as np
 
 from lfm_ppl.utils import checks
 
-_MOST_EXECUTABLES = 256
+_MOST_EXECUTABLES = 64
 """Executables that are kept for later programs of the same text; a `Program` keeps its own."""
 
-_MOST_PROGRAMS = 64
+_MOST_PROGRAMS = 16
 """Programs that a function decorated by `shared_jit` keeps, one for each model and each value of its settings."""
 
 _executables: OrderedDict[Hashable, Any] = OrderedDict()
