@@ -11,18 +11,6 @@ P53 = "time_h,replicate,DDB2,CDKN1A\n0,1,211.6,5.9\n0,2,168.002,\n2,1,482.582,11
 LONG = "ID,TIME,AMT,DV\n1,0,100,.\n1,24,.,9.2\n1,120,,2.5\n2,0,100,\n2,24,.,8.3\n2,120,,1.4\n"
 
 
-@pytest.fixture
-def write(tmp_path):
-    """Write a text to a file."""
-
-    def write_file(text):
-        path = tmp_path / "data.csv"
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return path
-
-    return write_file
-
-
 def test_times_values_missing_cells_and_the_unit_are_read(write):
     data = read_csv(write(P53))
     np.testing.assert_array_equal(data.times, [0.0, 0.0, 2.0])

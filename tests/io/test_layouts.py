@@ -136,18 +136,6 @@ def names(layouts):
     return [layout[0] for layout in layouts]
 
 
-@pytest.fixture
-def write(tmp_path):
-    """Write a file."""
-
-    def write_file(text):
-        path = tmp_path / "data.csv"
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return path
-
-    return write_file
-
-
 @pytest.mark.parametrize("layout", READ, ids=names(READ))
 def test_layouts_that_are_read(write, layout, recwarn):
     _, text, options, times = layout
