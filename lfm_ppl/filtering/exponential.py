@@ -31,7 +31,7 @@ import numpy as np
 from lfm_ppl.filtering.dynamics import Dynamics, covariance_of, is_autonomous, linearize_drift
 from lfm_ppl.filtering.moments import Moments, Prediction, compose, matvec, transform
 from lfm_ppl.filtering.transition import feedback
-from lfm_ppl.forces.discretise import discretise
+from lfm_ppl.forces.discretise import discretise_driven
 from lfm_ppl.model.state_space import Span
 from lfm_ppl.utils.linalg import outer_square
 
@@ -128,12 +128,7 @@ def _combine(weights: LinearSDE, start: LinearSDE, middle: LinearSDE, end: Linea
 
 
 def _flow(sde: LinearSDE, duration: jax.Array) -> _Flow:
-    """Discretise a linear SDE, with two more states: one that is constant, and the share of the duration so far."""
-    columns = duration * jnp.stack([sde.offset - 0.5 * sde.change, sde.change], axis=1)
-    # The unit of the offset must not raise the number of doublings.
-    unit = jax.lax.stop_gradient(jnp.maximum(jnp.max(jnp.abs(columns), initial=0.0), 1e-150))
-    below = np.zeros((2, columns.shape[0] + 2))
-    below[1, -2] = 1.0
-    augmented = jnp.concatenate([jnp.concatenate([duration * sde.feedback, columns / unit], axis=1), below])
-    phi, process_cov = discretise(augmented, jnp.pad(duration * sde.diffusion, (0, 2)), 1.0)
-    return _Flow(unit * phi[:-2, -2], phi[:-2, :-2], process_cov[:-2, :-2])
+    """Discretise a linear SDE over a part of the step."""
+    input_ends = sde.offset + jnp.stack([-0.5 * sde.change, 0.5 * sde.change])
+    phi, offset, process_cov = discretise_driven(sde.feedback, input_ends, sde.diffusion, duration)
+    return _Flow(offset, phi, process_cov)

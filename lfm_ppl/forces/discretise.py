@@ -218,6 +218,39 @@ def double(
     return jnp.where(is_complete, phi, jnp.nan), jnp.where(is_complete, 0.5 * (q + q.mT), jnp.nan)
 
 
+def discretise_driven(feedback: jax.Array, input_ends: jax.Array, diffusion: jax.Array,
+                      duration: ArrayLike) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return transition, offset and process noise of a linear SDE with an input that is linear in time.
+
+    For ``dz = (F z + b(s)) ds + L dbeta`` with ``D = L L'`` and b linear over the step, the state at the end is
+    ``Phi z + offset + N(0, Q)``. Two more states carry b: a constant one, and the share of the step so far.
+
+    Args:
+        feedback: ``F`` (n, n), in 1/time.
+        input_ends: b at the start and at the end, (2, n).
+        diffusion: ``D`` (n, n).
+        duration: length of the step, a scalar.
+
+    Returns:
+        ``Phi`` (n, n), the offset (n,) and ``Q`` (n, n).
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> zero = jnp.zeros((1, 1))
+        >>> float(discretise_driven(zero, jnp.array([[0.0], [2.0]]), zero, 3.0)[1][0])
+        3.0
+    """
+    start, end = input_ends
+    columns = duration * jnp.stack([start, end - start], axis=1)
+    # The unit of the input must not raise the number of doublings.
+    unit = jax.lax.stop_gradient(jnp.maximum(jnp.max(jnp.abs(columns), initial=0.0), 1e-150))
+    below = np.zeros((2, columns.shape[0] + 2))
+    below[1, -2] = 1.0
+    augmented = jnp.concatenate([jnp.concatenate([duration * feedback, columns / unit], axis=1), below])
+    transition, noise = discretise(augmented, jnp.pad(duration * diffusion, (0, 2)), 1.0)
+    return transition[:-2, :-2], unit * transition[:-2, -2], noise[:-2, :-2]
+
+
 def repeat(function: Callable[..., tuple], values: tuple, count: jax.Array, most: int) -> Any:
     """Apply ``values = function(*values)`` a number of times that may be traced.
 

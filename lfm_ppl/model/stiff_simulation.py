@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.forces.discretise import discretise
+from lfm_ppl.forces.discretise import discretise_driven
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import matmul, outer_square, semidefinite_root
 
@@ -36,26 +36,18 @@ def divide_steps(times: Any, start: Any, steps: int, breakpoints: Any, longest_s
 
 
 def exponential_change(h: jax.Array, jacobian: jax.Array, drift: jax.Array, drift_at_end: jax.Array,
-                        dispersion: jax.Array | None, key: jax.Array) -> jax.Array:
+                       dispersion: jax.Array | None, key: jax.Array) -> jax.Array:
     """Return the change c (M,) of the physical state by the exact solution of the linearised SDE.
 
     It is dc = (J c + b(s)) ds + G dB over a step of length h, with the Jacobian J and the dispersion G at the start of
     the step, and b linear in time from ``drift`` to ``drift_at_end``, both at the state at the start.
     """
     size = drift.shape[0]
-    # Two more states carry b: one that is constant, and the share of the step so far.
-    columns = h * jnp.stack([drift, drift_at_end - drift], axis=1)
-    unit = jnp.maximum(jnp.max(jnp.abs(columns), initial=0.0), 1e-150)
-    below = np.zeros((2, size + 2))
-    below[1, -2] = 1.0
-    augmented = jnp.concatenate([jnp.concatenate([h * jacobian, columns / unit], axis=1), below])
     diffusion = jnp.zeros((size, size)) if dispersion is None else outer_square(dispersion)
-    transition, covariance = discretise(augmented, jnp.pad(h * diffusion, (0, 2)), 1.0)
-    change = unit * transition[:size, -2]
+    _, change, covariance = discretise_driven(jacobian, jnp.stack([drift, drift_at_end]), diffusion, h)
     if dispersion is None:
         return change
-    root = semidefinite_root(covariance[:size, :size])
-    return change + matmul(root, jax.random.normal(key, (size, 1)))[:, 0]
+    return change + matmul(semidefinite_root(covariance), jax.random.normal(key, (size, 1)))[:, 0]
 
 
 def warn_of_infinite_states(states: Any, times: Any, names: tuple[str, ...]) -> None:
