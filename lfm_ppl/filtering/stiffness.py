@@ -12,7 +12,7 @@ the rest explicitly. Two limits follow.
 
 `explicit_steps` follows the mean through each interval from the filtered mean at its start, by linearly implicit Euler
 steps, which are stable, and records K where it is largest: a decay that saturates may be slow at all rows and fast
-between them. `long_step` compares the eigenvalues with the steps, outside of compiled code.
+between them. `long_step_message` compares the eigenvalues with the steps, outside of compiled code.
 
 Source: Hairer and Wanner (1996), Solving Ordinary Differential Equations II, sections IV.2 and IV.7.
 """
@@ -184,9 +184,14 @@ def warn_of_long_steps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, steps: 
     if not np.isfinite(np.asarray(log_likelihood)).all():
         return
     mean = filtered_mean() if callable(filtered_mean) else filtered_mean
-    long = long_step(_compiled_explicit_steps(ssm, grid, mean, initial_mean))
-    if long is not None:
-        checks.warn(long_step_message(long, ssm.model.state_names, steps), FilterWarning)
+    warn_of_message(long_step_message(_compiled_explicit_steps(ssm, grid, mean, initial_mean), ssm.model.state_names,
+                                      steps))
+
+
+def warn_of_message(message: str | None) -> None:
+    """Warn of a step that is too long; None: there is none."""
+    if message is not None:
+        checks.warn(message, FilterWarning)
 
 
 def decay_rates(matrices: np.ndarray) -> np.ndarray:
@@ -256,17 +261,20 @@ def _participations(matrix: np.ndarray) -> np.ndarray:
     return products / np.maximum(products.sum(axis=0), 1e-300)
 
 
-def long_step_message(long: LongStep, state_names: tuple[str, ...], steps: int, has_method: bool = True,
-                      regime_names: tuple[str, ...] = ()) -> str:
-    """Return a sentence on a step that is too long, with the remedy.
+def long_step_message(explicit: ExplicitSteps, state_names: tuple[str, ...], steps: int, has_method: bool = True,
+                      regime_names: tuple[str, ...] = ()) -> str | None:
+    """Return a sentence on the first step that is too long, with the remedy; None where no step is.
 
     Args:
-        long: the step.
+        explicit: what limits the steps, concrete.
         state_names: names of the states.
         steps: integration steps between two consecutive times.
         has_method: whether the likelihood has a ``method``.
-        regime_names: names of the regimes, where the series of ``long`` are regimes.
+        regime_names: names of the regimes, where the series of ``explicit`` are regimes.
     """
+    long = long_step(explicit)
+    if long is None:
+        return None
     series = ""
     if long.series is not None:
         series = f"regime {regime_names[long.series]!r}, " if regime_names else f"series {long.series}, "

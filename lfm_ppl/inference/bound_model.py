@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from numpyro.infer import init_to_median
 
-from lfm_ppl.filtering.breakdown import FilterWarning, warn_of_iterations
+from lfm_ppl.filtering.breakdown import warn_of_iterations
 from lfm_ppl.filtering.filter import FilterResult
 from lfm_ppl.filtering.smoother import SmootherResult
-from lfm_ppl.filtering.stiffness import ExplicitSteps, long_step, long_step_message
+from lfm_ppl.filtering.stiffness import ExplicitSteps, long_step_message, warn_of_message
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood, single_site
@@ -455,7 +455,7 @@ class BoundModel:
         return self._run_at("explicit steps", steps, z, y, at)
 
     def _run_at(self, name: str, function: Callable[[LikelihoodSite, Any], Any], z: Any, y: Any, at: Any) -> Any:
-        """Return a compiled function of the likelihood site at z and requested times (K,); None: those of the data."""
+        """Return a function, compiled, of the likelihood site at z and of requested times (K,) or None."""
         times = None if at is None else np.atleast_1d(np.asarray(at, float))
 
         def run(z: Any, y: Any) -> Any:
@@ -469,13 +469,23 @@ class BoundModel:
 
     def _warn_of_long_steps(self, log_likelihood: Any, z: Any, y: Any, at: Any = None) -> None:
         """Warn where a step is too long for a fast decay; nothing happens in compiled code."""
+        if not checks.traced(log_likelihood) and np.isfinite(log_likelihood).all():
+            warn_of_message(self.long_step_message(z, y, at))
+
+    def long_step_message(self, z: Any, y: Any = None, at: Any = None, has_method: bool = True) -> str | None:
+        """Return a sentence on an explicit step that is too long for a fast decay at z; None where no step is.
+
+        Args:
+            z: (d,), or site name -> value, concrete.
+            y: as in `log_density`.
+            at: as in `explicit_steps`.
+            has_method: whether ``method`` is a remedy, if the likelihood has it; not so for particles.
+        """
         example = self.site.example
-        if checks.traced(log_likelihood) or not example.has_explicit_steps or not np.isfinite(log_likelihood).all():
-            return
-        long = long_step(self.explicit_steps(z, y, at))
-        if long is not None:
-            checks.warn(long_step_message(long, example.ssm.model.state_names, example.steps,
-                                          "method" in example.settings, example.regime_names), FilterWarning)
+        if not example.has_explicit_steps:
+            return None
+        return long_step_message(self.explicit_steps(z, y, at), example.ssm.model.state_names, example.steps,
+                                 has_method and "method" in example.settings, example.regime_names)
 
     def _check_single(self, name: str) -> None:
         if isinstance(self.site.distribution, Panel):

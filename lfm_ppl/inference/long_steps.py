@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from lfm_ppl.filtering.stiffness import long_step, long_step_message
 from lfm_ppl.inference.bound_model import BoundModel
 
 
@@ -18,10 +17,6 @@ def long_step_messages(bound: BoundModel, z: np.ndarray, has_method: bool = True
     """
     messages = []
     for name, site_model in bound.site_models.items():
-        example = site_model.site.example
-        long = long_step(site_model.explicit_steps(z)) if example.has_explicit_steps else None
-        if long is not None:
-            message = long_step_message(long, example.ssm.model.state_names, example.steps,
-                                        has_method and "method" in example.settings, example.regime_names)
+        if (message := site_model.long_step_message(z, has_method=has_method)) is not None:
             messages.append(f"site {name!r}: {message}" if bound.is_by_site else message)
     return messages

@@ -19,10 +19,9 @@ from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
 from lfm_ppl.filtering.arguments import as_rule
-from lfm_ppl.filtering.breakdown import FilterWarning
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA
-from lfm_ppl.filtering.stiffness import has_explicit_steps, long_step, long_step_message
+from lfm_ppl.filtering.stiffness import long_step_message, warn_of_message
 from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, refuse_times_by_site, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
@@ -150,13 +149,12 @@ class Panel(dist.Distribution):
     def _warn_of_long_steps(self, y: jax.Array, log_likelihood: jax.Array) -> None:
         """Warn where a step of a series is too long for a fast decay, outside of compiled code."""
         first = self.first
-        if checks.traced((self.parameters, self.times, log_likelihood)) or not has_explicit_steps(
-                first.ssm, first.rule, first.time_grid) or not np.isfinite(np.asarray(log_likelihood)).all():
+        if checks.traced((self.parameters, self.times, log_likelihood)) or not first.has_explicit_steps:
+            return
+        if not np.isfinite(np.asarray(log_likelihood)).all():
             return
         explicit_steps = Program(lambda y: self.mapped(lambda series, y: series.explicit_steps(y), y))
-        long = long_step(explicit_steps(y))
-        if long is not None:
-            checks.warn(long_step_message(long, first.model.state_names, first.steps), FilterWarning)
+        warn_of_message(long_step_message(explicit_steps(y), first.model.state_names, first.steps))
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate every series: (*sample_shape, B, T, D)."""

@@ -29,8 +29,8 @@ from lfm_ppl.filtering.stiffness import (
     ExplicitSteps,
     explicit_steps,
     has_explicit_steps,
-    long_step,
     long_step_message,
+    warn_of_message,
 )
 from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
@@ -56,6 +56,7 @@ from lfm_ppl.switching.switched_model import SwitchedProblem, with_forces_of
 from lfm_ppl.switching.switched_simulation import simulate_paths
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
+from lfm_ppl.utils.programs import Program
 
 SMOOTHER_DRAWS = 256
 """Draws of regimes over which the smoother averages; they have the same random numbers in each call."""
@@ -224,10 +225,8 @@ class Switching(SeriesLikelihood):
         if not np.isfinite(np.asarray(log_likelihood)).all():
             return
         # One program: eager operations take longer to compile, one by one.
-        long = long_step(jax.jit(lambda y: self._explicit_steps_on(grid, y))(y))
-        if long is not None:
-            checks.warn(long_step_message(long, self.models[0].state_names, steps, regime_names=self.regime_names),
-                        FilterWarning)
+        limits = Program(lambda y: self._explicit_steps_on(grid, y))(y)
+        warn_of_message(long_step_message(limits, self.models[0].state_names, steps, regime_names=self.regime_names))
 
     def breakdown(self, y: jax.Array) -> str:
         """Return a sentence on the first row at which the density is not finite."""
@@ -264,7 +263,7 @@ class Switching(SeriesLikelihood):
         y = self.checked(y)
         grid = self.smoother_grid(at, steps)
         # One program: eager operations take longer to compile, one by one.
-        result = jax.jit(lambda y: self._smooth(y, grid))(y)
+        result = Program(lambda y: self._smooth(y, grid))(y)
         self._warn_of_long_steps(grid, self.steps if steps is None else steps, y, result.log_likelihood)
         return result
 
