@@ -39,7 +39,7 @@ from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.model_arguments import Identity, ModelArguments, ModelInputs, shapes
 from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, latent_sites
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.programs import Program
+from lfm_ppl.utils.programs import Program, remembered
 
 _MOST_STRUCTURES = 32
 """Structures of a model whose programs are kept for further data sets."""
@@ -222,12 +222,9 @@ class TracedModel:
         leaves, structure = jax.tree.flatten(arguments)
         key = self.identity, structure, *self._structures, *((leaf.shape, str(leaf.dtype)) for leaf in leaves)
         by_structure = (_programs_in_use.get() or SharedPrograms()).by_structure
-        if key not in by_structure:
-            by_structure[key] = {} if self._is_traceable(arguments) else None
-            if len(by_structure) > _MOST_STRUCTURES:
-                by_structure.popitem(last=False)
-        by_structure.move_to_end(key)
-        if (programs := by_structure[key]) is not None:
+        programs = remembered(by_structure, key, lambda: {} if self._is_traceable(arguments) else None,
+                              _MOST_STRUCTURES)
+        if programs is not None:
             self.programs, self.inputs = programs, inputs
         return self
 

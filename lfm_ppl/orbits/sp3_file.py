@@ -264,8 +264,8 @@ def _read_positions(
     flags = {name: np.zeros(shape, dtype=bool) for name in FLAGS}
     for cell, number in zip(cells, line_numbers, strict=True):
         line = text.lines[number - 1]
-        for name, (place, letter) in FLAGS.items():
-            flags[name].flat[cell] = line[place - 1 : place] == letter
+        for name, (column, letter) in FLAGS.items():
+            flags[name].flat[cell] = line[column - 1 : column] == letter
     return _positions(text, shape, cells, values, line_numbers), epochs, flags
 
 

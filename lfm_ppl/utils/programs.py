@@ -91,7 +91,7 @@ def shared_jit(function: Callable) -> Callable:
 
         leaves, structure = jax.tree.flatten(constants)
         key = structure, *((type(leaf), leaf) for leaf in leaves)
-        return _remembered(programs, key, lambda: Program(run), _MOST_PROGRAMS)(arrays)
+        return remembered(programs, key, lambda: Program(run), _MOST_PROGRAMS)(arrays)
 
     return call
 
@@ -109,10 +109,10 @@ def forget_executables() -> None:
 
 def _compile(lowered: Any, kinds: Hashable) -> Any:
     key = hashlib.sha256(lowered.as_text().encode()).digest(), lowered.out_tree, kinds
-    return _remembered(_executables, key, lowered.compile, _MOST_EXECUTABLES)
+    return remembered(_executables, key, lowered.compile, _MOST_EXECUTABLES)
 
 
-def _remembered(table: OrderedDict[Hashable, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:
+def remembered(table: OrderedDict[Hashable, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:
     """Return the entry of a table of the latest entries, made at the first call; threads may share the table."""
     with _lock:
         if key in table:
