@@ -439,24 +439,25 @@ class BoundModel:
         self._warn_of_long_steps(result.log_likelihood, z, y, at)
         return result
 
-    def explicit_steps(self, z: Any, y: Any = None, at: Any = None) -> ExplicitSteps:
+    def explicit_steps(self, z: Any, y: Any = None, requested_times: Any = None) -> ExplicitSteps:
         """Return what limits the explicit steps of the filter; series of a panel, or regimes, are a leading axis.
 
         Args:
             z: (d,), or site name -> value.
             y: as in `log_density`.
-            at: (K,) requested times of a single series; None: the times of the data.
+            requested_times: (K,), of a single series; None: the times of the data.
         """
         def steps(site: LikelihoodSite, times: Any) -> Any:
             if isinstance(site.distribution, Panel):
                 return site.distribution.mapped(lambda series, y: series.explicit_steps(y), site.observed)
             return site.distribution.explicit_steps(site.observed, times)
 
-        return self._run_at("explicit steps", steps, z, y, at)
+        return self._run_at("explicit steps", steps, z, y, requested_times)
 
-    def _run_at(self, name: str, function: Callable[[LikelihoodSite, Any], Any], z: Any, y: Any, at: Any) -> Any:
+    def _run_at(self, name: str, function: Callable[[LikelihoodSite, Any], Any], z: Any, y: Any,
+                requested_times: Any) -> Any:
         """Return a function, compiled, of the likelihood site at z and of requested times (K,) or None."""
-        times = None if at is None else np.atleast_1d(np.asarray(at, float))
+        times = None if requested_times is None else np.atleast_1d(np.asarray(requested_times, float))
 
         def run(z: Any, y: Any) -> Any:
             return function(self._site_at(z, y), times)
@@ -467,24 +468,26 @@ class BoundModel:
         return self.compiled((name, signature(times)), lambda: Program(run))(
             _as_arrays(z), None if self.argument is None else data)
 
-    def _warn_of_long_steps(self, log_likelihood: Any, z: Any, y: Any, at: Any = None) -> None:
+    def _warn_of_long_steps(self, log_likelihood: Any, z: Any, y: Any, requested_times: Any = None) -> None:
         """Warn where a step is too long for a fast decay; nothing happens in compiled code."""
         if not checks.traced(log_likelihood) and np.isfinite(log_likelihood).all():
-            warn_of_message(self.long_step_message(z, y, at))
+            warn_of_message(self.long_step_message(z, y, requested_times))
 
-    def long_step_message(self, z: Any, y: Any = None, at: Any = None, has_method: bool = True) -> str | None:
+    def long_step_message(self, z: Any, y: Any = None, requested_times: Any = None,
+                          has_method: bool = True) -> str | None:
         """Return a sentence on an explicit step that is too long for a fast decay at z; None where no step is.
 
         Args:
             z: (d,), or site name -> value, concrete.
             y: as in `log_density`.
-            at: as in `explicit_steps`.
+            requested_times: as in `explicit_steps`.
             has_method: whether ``method`` is a remedy, if the likelihood has it; not so for particles.
         """
         example = self.site.example
         if not example.has_explicit_steps:
             return None
-        return long_step_message(self.explicit_steps(z, y, at), example.ssm.model.state_names, example.steps,
+        explicit = self.explicit_steps(z, y, requested_times)
+        return long_step_message(explicit, example.ssm.model.state_names, example.steps,
                                  has_method and "method" in example.settings, example.regime_names)
 
     def _check_single(self, name: str) -> None:

@@ -126,7 +126,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     return paths
 
 
-def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: np.ndarray | None,
+def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requested_times: np.ndarray | None,
            settings: tuple[ParticleSettings | None, int | None], is_stiff: bool, **options: Any) -> dict[str, Any]:
     """Return the results of `trajectories`, and of simulated paths the largest product of a step and the fastest rate.
 
@@ -134,7 +134,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: np.n
         key: a JAX random key.
         bound: the model and its data.
         draws: as in `trajectories`.
-        at: as in `trajectories`.
+        requested_times: ``at`` of `trajectories`.
         settings: ``particles`` and ``particle_steps`` of `trajectories`.
         is_stiff: whether simulated steps that are longer than the fastest time constant are exponential.
         **options: ``report`` and ``store`` of `map_draws`.
@@ -143,14 +143,14 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: np.n
     example = bound.site.example
     is_forecast = None
     if particles is None and example.has_gaussian_state and example.ssm.drift_structure.nonlinear:
-        is_forecast = has_forecast(bound, at)
+        is_forecast = has_forecast(bound, requested_times)
     is_shared = particles is None and bound.traced.inputs is not None
-    count = None if at is None else at.shape[-1]
-    if at is not None and is_shared and not is_forecast:
+    count = None if requested_times is None else requested_times.shape[-1]
+    if requested_times is not None and is_shared and not is_forecast:
         # Repetitions of the last time, so that similar times share a program; their results are removed below.
-        extra = padded_size(at.size + bound.times.size) - at.size - bound.times.size
-        at = np.append(at, np.repeat(at[-1], extra))
-    plan = plan_paths(bound, at, particles is not None or is_forecast is not None,
+        extra = padded_size(requested_times.size + bound.times.size) - requested_times.size - bound.times.size
+        requested_times = np.append(requested_times, np.repeat(requested_times[-1], extra))
+    plan = plan_paths(bound, requested_times, particles is not None or is_forecast is not None,
                  first_simulated_times(bound) if is_forecast else np.full(bound.times.shape[:-1], -np.inf))
 
     def draw_series(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array, path_times: Any = plan.times,
@@ -188,7 +188,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: np.n
         results["deterministic"] = jax.vmap(ssm.deterministics)(w[requested], when[requested])
         if isinstance(ssm.model.observation, ObservationFamily):
             results |= _of_family(ssm, keys, w, when, plan)
-            if at is not None and noise_of_rows(distribution):
+            if requested_times is not None and noise_of_rows(distribution):
                 del results["prediction"]
             return results
         output = jax.vmap(ssm.observe)(w, when)
@@ -207,10 +207,10 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: np.n
             mean = jnp.where(is_smoothed[requested], normal_mean, mean)
             variance = jnp.where(is_smoothed[requested], jnp.maximum(spread, 0.0), 0.0)
         results |= {"predictive_mean": mean, "output_sd": jnp.sqrt(variance)}
-        if at is not None and noise_of_rows(distribution):
+        if requested_times is not None and noise_of_rows(distribution):
             return results
         prediction = replicated
-        if at is not None:
+        if requested_times is not None:
             covariance = jax.vmap(ssm.obs_cov)(w[requested], when[requested], jnp.zeros(len(requested), int))
             prediction = with_noise(keys["prediction"], output[requested], covariance)
         noise = jnp.diagonal(covariance, axis1=1, axis2=2)
@@ -232,13 +232,13 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: np.n
         # Where the path is simulated the smoother stays at the last row of the data, at no cost.
         reached = plan.times if plan.times is None or not is_forecast else np.minimum(plan.times, bound.times.max())
         inputs = None if reached is None else bound.traced.lay_out(bound.site.name, reached)
-        name = (*name, len(plan.requested), plan.rows, at is None, plan.steps if is_forecast else None)
+        name = (*name, len(plan.requested), plan.rows, requested_times is None, plan.steps if is_forecast else None)
         paths = map_draws(bound, name, SharedFunction(shared_per_draw, (plan.times, inputs)), draws, key,
                           rows=plan.rows, **options)
         return {name: value if name in ("y", "log_likelihood", _PRODUCT) else value[..., :count, :]
                 for name, value in paths.items()}
     rows = plan.rows * (1 if particles is None else particles.particles)
-    return map_draws(bound, (*name, signature(at)), per_draw, draws, key, rows=rows, **options)
+    return map_draws(bound, (*name, signature(requested_times)), per_draw, draws, key, rows=rows, **options)
 
 
 def _of_family(ssm: StateSpaceModel, keys: Mapping[str, jax.Array], w: jax.Array, when: jax.Array,

@@ -219,26 +219,26 @@ class SeriesLikelihood(dist.Distribution):
         """Whether a filter takes explicit steps of fixed length, see `lfm_ppl.filtering.stiffness`."""
         return any(has_explicit_steps(ssm, self.rule, self.time_grid) for ssm in self.ssms)
 
-    def explicit_steps(self, y: jax.Array, at: Any = None) -> ExplicitSteps | None:
+    def explicit_steps(self, y: jax.Array, requested_times: Any = None) -> ExplicitSteps | None:
         """Return what limits the explicit steps of the filter of ``y`` (T, D); None where there are none.
 
-        Several regimes are a leading axis. ``at`` (K,) are requested times as in `smooth`.
+        Several regimes are a leading axis; ``requested_times`` (K,) as in `smooth`.
         """
         if not self.has_explicit_steps:
             return None
-        grid = self.smoother_grid(at)
+        grid = self.smoother_grid(requested_times)
         # Linearised at the mean: the rates need no more, and this compiles fastest.
         result = filter_on(self.ssm, Taylor(), grid, y, jnp.asarray(self.times, float))
         return explicit_steps(self.ssm, grid, result.filtered_mean)
 
-    def smoother_grid(self, at: Any = None, steps: int | None = None) -> TimeGrid:
+    def smoother_grid(self, requested_times: Any = None, steps: int | None = None) -> TimeGrid:
         """Return the time grid of `smooth`, with its arguments."""
-        if at is None and steps is None:
+        if requested_times is None and steps is None:
             return self.time_grid
-        if isinstance(at, GridLayout):
-            return self.grid_of(at)
-        return build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step, at,
-                               tolerance=self.tolerance)._replace(method=self.method)
+        if isinstance(requested_times, GridLayout):
+            return self.grid_of(requested_times)
+        return build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step,
+                               requested_times, tolerance=self.tolerance)._replace(method=self.method)
 
     def smooth(self, y: Any, at: Any = None, steps: int | None = None) -> SmootherResult:
         """Smooth with this distribution's settings, or with other ``steps``; see `lfm_ppl.smooth`.

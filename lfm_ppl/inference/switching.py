@@ -200,12 +200,12 @@ class Switching(SeriesLikelihood):
         self._warn_of_long_steps(self.time_grid, self.steps, y, log_likelihood)
         return log_likelihood
 
-    def explicit_steps(self, y: jax.Array, at: Any = None) -> ExplicitSteps | None:
+    def explicit_steps(self, y: jax.Array, requested_times: Any = None) -> ExplicitSteps | None:
         """Return what limits the explicit steps of each of the regimes (K, ...); None where there are none.
 
         Each regime is followed from the filtered means, merged over all regimes.
         """
-        return self._explicit_steps_on(self.smoother_grid(at), y) if self.has_explicit_steps else None
+        return self._explicit_steps_on(self.smoother_grid(requested_times), y) if self.has_explicit_steps else None
 
     def _explicit_steps_on(self, grid: TimeGrid, y: jax.Array) -> ExplicitSteps:
         probability, moments, _ = filter_regimes(self.regimes(grid), y).filtered
