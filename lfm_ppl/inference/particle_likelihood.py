@@ -189,9 +189,9 @@ class ParticlePotential:
         Estimates of zero count as the worst of the others; infinite where they are the majority.
         """
         name = ("spread of estimates", self.settings._replace(particles=particles), self._steps)
-        run = self._bound.compiled(name, lambda: Program(
-            lambda z, keys, y: jax.lax.map(lambda k: self(z, k, particles, y), keys)))
-        energies = np.asarray(run(z, jax.random.split(key, _REPLICATES), self._bound.argument))
+        run = self._bound.program(name, lambda: Program(
+            lambda z, keys, y: jax.lax.map(lambda k: self(z, k, particles, y), keys)), self._bound.constants)
+        energies = np.asarray(run(z, jax.random.split(key, _REPLICATES), self._bound.constants))
         finite = np.isfinite(energies)
         if finite.mean() < 0.5:
             return float("inf")
