@@ -10,9 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lfm_ppl.filtering.arguments import check_observations
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.utils import checks
 
@@ -157,13 +155,8 @@ def _check_data(bound: BoundModel, values: jax.Array) -> None:
         raise ValueError(f"the likelihood site {name!r} observes the times, not the data. {remedy}")
     if bound.is_by_site and name in bound.traced.sites_of_other_data(bound.constants):
         raise ValueError(f"the likelihood site {name!r} observes other data than those that were passed. {remedy}")
-    distribution = bound.site.distribution
     try:
-        if isinstance(distribution, Panel):
-            distribution.checked(values)
-        else:
-            rows, outputs = distribution.event_shape
-            check_observations(values, rows, outputs, model=distribution.model)
+        bound.site.distribution.checked(values)
     except ValueError as error:
         raise ValueError(f"site {name!r}: {error}" if bound.is_by_site else str(error)) from None
 

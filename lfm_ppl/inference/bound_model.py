@@ -24,11 +24,11 @@ from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.stiffness import ExplicitSteps, long_step_message, warn_of_message
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.settings import approximate
+from lfm_ppl.inference.likelihood import Likelihood
 from lfm_ppl.inference.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood, single_site
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.problem import Partition, Problem, signature
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.inference.trace import Programs, TracedModel, trace_model
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.programs import Program
@@ -400,7 +400,7 @@ class BoundModel:
     # --- the filter and the smoother
 
     def likelihood(self, z: ArrayLike | Mapping[str, Any],
-                   y: ArrayLike | Problem | None = None) -> SeriesLikelihood | Panel:
+                   y: ArrayLike | Problem | None = None) -> Likelihood:
         """Return the likelihood at parameters, in compiled code too.
 
         Args:
@@ -470,9 +470,7 @@ class BoundModel:
             requested_times: (K,), of a single series; None: the times of the data.
         """
         def steps(site: LikelihoodSite, times: Any) -> Any:
-            if isinstance(site.distribution, Panel):
-                return site.distribution.mapped(lambda series, y: series.explicit_steps(y), site.observed)
-            return site.distribution.explicit_steps(site.observed, times)
+            return site.distribution.mapped(lambda series, y: series.explicit_steps(y, times), site.observed)
 
         return self._run_at("explicit steps", steps, z, y, requested_times)
 

@@ -18,8 +18,6 @@ import jax
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.utils.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
 from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.progress import Progress, Reporter
@@ -49,13 +47,6 @@ class BatchStore(Protocol):
 
     def flush(self) -> None:
         """Write all stored batches."""
-
-
-def map_series(distribution: SeriesLikelihood | Panel, function: Callable, *arguments: Any) -> Any:
-    """Return ``function(distribution, *arguments)``; for a panel, for each series, with the series as leading axis."""
-    if isinstance(distribution, Panel):
-        return distribution.mapped(function, *arguments)
-    return function(distribution, *arguments)
 
 
 def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, *,

@@ -15,9 +15,8 @@ from numpyro.infer.util import potential_energy
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.likelihood import Likelihood
 from lfm_ppl.inference.problem import Problem
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.inference.switching import Switching
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -95,9 +94,9 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         super().begin()
         self.values, self.settings = [], ""
 
-    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> Any:
         """Evaluate the models of the likelihood, of its first series for a panel."""
-        distribution = likelihood.first if isinstance(likelihood, Panel) else likelihood
+        distribution = likelihood.first
         ssm, model = distribution.ssm, distribution.model
         # Not the leaves of the distribution itself: NumPyro orders its fields by their hashes.
         names = sorted(set(type(likelihood).gather_pytree_data_fields()) - {"model", "models"})

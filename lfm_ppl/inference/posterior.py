@@ -21,8 +21,7 @@ from lfm_ppl.filtering.intervals import EXPONENTIAL
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.map_draws import BatchStore, map_draws, map_series
-from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.map_draws import BatchStore, map_draws
 from lfm_ppl.inference.path_plan import PathPlan, first_simulated_times, has_forecast, plan_paths
 from lfm_ppl.inference.problem import Partition, Problem, signature
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
@@ -70,8 +69,8 @@ def scores(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], *,
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         log_priors = {LOG_PRIOR + name: value for name, value in bound.site_log_priors(values, y).items()}
         distribution, y = bound.likelihood(values, y), bound.data(y)
-        keys = jax.random.split(key, y.shape[0]) if isinstance(distribution, Panel) else key
-        return map_series(distribution, lambda series, y, key: series.scores(key, y), y, keys) | log_priors
+        keys = distribution.split_key(key)
+        return distribution.mapped(lambda series, y, key: series.scores(key, y), y, keys) | log_priors
 
     return map_draws(bound, "scores", per_draw, draws, key, rows=bound.times.size,
                      report=report, store=store)
@@ -219,8 +218,8 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
     def per_draw(values: Any, key: jax.Array, problem: Problem) -> dict[str, jax.Array]:
         distribution = bound.likelihood(values, problem)
         y = bound.data(problem)
-        keys = jax.random.split(key, y.shape[0]) if isinstance(distribution, Panel) else key
-        return map_series(distribution, draw_series, y, keys, *([plan.times] if plan.is_of_series else []))
+        keys = distribution.split_key(key)
+        return distribution.mapped(draw_series, y, keys, *([plan.times] if plan.is_of_series else []))
 
     def shared_per_draw(values: Any, key: jax.Array, problem: Problem, times: Any,
                         reached: Partition) -> dict[str, jax.Array]:
