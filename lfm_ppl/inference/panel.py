@@ -21,8 +21,8 @@ from lfm_ppl.filtering.arguments import as_rule
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA
 from lfm_ppl.filtering.stiffness import long_step_message, warn_of_message
+from lfm_ppl.inference.constrained_likelihood import likelihood_with
 from lfm_ppl.inference.likelihood import Likelihood
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, refuse_times_by_site, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.events import check_start, event_table
@@ -88,7 +88,7 @@ class Panel(Likelihood):
         return np.ndim(self.times) == 2
 
     def _likelihood(self, parameters: Any, times: Any) -> SeriesLikelihood:
-        return MarginalLikelihood(self.build(parameters), times, **self.settings)
+        return likelihood_with(self.build(parameters), times, self.settings)
 
     def _check_events(self, count: int) -> None:
         """Raise ValueError if an event of a series lies before its initial time."""

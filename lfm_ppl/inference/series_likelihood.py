@@ -351,6 +351,12 @@ class SeriesLikelihood(Likelihood):
         return values[:-2]
 
 
+def check_model(model: Any) -> None:
+    """Raise TypeError unless ``model`` is a latent force model."""
+    if not isinstance(model, LatentForceModel):
+        raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
+
+
 def refuse_times_by_site(times: Any) -> None:
     """Raise TypeError if the times of one site are a dict of the times of several sites."""
     if isinstance(times, Mapping):

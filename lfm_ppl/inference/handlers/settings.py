@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from lfm_ppl.inference.constrained_likelihood import likelihood_with
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.inference.likelihood import Likelihood
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.switching import Switching
 
@@ -71,4 +71,4 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         settings |= ({"iterations": 0} if is_single_pass else {}) | self.settings
         if isinstance(likelihood, Panel):
             return Panel(likelihood.build, likelihood.parameters, likelihood.times, settings)
-        return MarginalLikelihood(likelihood.model, likelihood.times, **settings)
+        return likelihood_with(likelihood.model, likelihood.times, settings)
