@@ -44,6 +44,10 @@ _ATTEMPTS = 20
 """Points that are drawn in the search for one of finite density."""
 
 
+class StartError(ValueError):
+    """No point of finite density was found to start from."""
+
+
 class BoundModel:
     r"""A NumPyro model with its times bound: its log density as a function of one vector and of the data.
 
@@ -372,7 +376,7 @@ class BoundModel:
             evaluate: function of z; None: the log density and its gradient.
 
         Raises:
-            ValueError: no point has finite values.
+            StartError: no point has finite values.
         """
         keys = split_keys(key, attempts)
         for attempt in range(attempts):
@@ -380,7 +384,7 @@ class BoundModel:
             values = jax.tree.leaves((evaluate or self.log_density_gradient)(z))
             if all(np.all(np.isfinite(value)) for value in values):
                 return z
-        raise ValueError(f"found no point of finite density to start from in {attempts} attempts. Give a starting "
+        raise StartError(f"found no point of finite density to start from in {attempts} attempts. Give a starting "
                          "point, or check the model: its log density or the gradient of it is not finite.")
 
     def trace(self) -> dict[str, Any]:
