@@ -173,5 +173,5 @@ def bind_arguments(model: Callable, arguments: tuple, keywords: Mapping[str, Any
         caller: name of the calling function, for messages.
     """
     if isinstance(model, SharedModel):
-        return BoundModel.of(model.model, arguments, keywords, caller, model.programs)
+        return BoundModel.of(model.fn, arguments, keywords, caller, model.programs)
     return BoundModel.of(model, arguments, keywords, caller)

@@ -14,6 +14,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import re
 from collections.abc import Callable, Hashable, Mapping
@@ -65,15 +66,15 @@ class SharedModel:
 
     def __init__(self, model: Callable) -> None:
         functools.update_wrapper(self, model)
-        self.model, self.programs = model, Programs()
+        self.fn, self.programs = model, Programs()  # ``fn`` as in NumPyro's handlers
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         """Run the model."""
-        return self.model(*arguments, **keywords)
+        return self.fn(*arguments, **keywords)
 
     def __reduce__(self) -> tuple[type[SharedModel], tuple]:
         """Leave the programs out, which belong to one process."""
-        return SharedModel, (self.model,)
+        return SharedModel, (self.fn,)
 
 
 class TracedModel:
@@ -287,10 +288,12 @@ def trace_model(model: Callable, arguments: tuple, keywords: Mapping[str, Any], 
             traced = TracedModel(model, problem, caller)
             times, structures = traced.constant_times(problem)
         except _TRACING_ERRORS:
-            # The model needs the values of its data; any other error is raised again.
+            # The model needs the values of its data; any other error is raised again, by its first density at last.
             problem = Problem.of_constants(arguments, keywords)
             traced = TracedModel(model, problem, caller)
-            times, structures = traced.constant_times(problem)
+            times, structures = {}, []
+            with contextlib.suppress(*_TRACING_ERRORS):
+                times, structures = traced.constant_times(problem)
         tabulated = None if checks.traced((arguments, dict(keywords))) else _with_traced_inputs(
             traced, problem, times, structures, programs or Programs())
     constant = {name: site_times._replace(layout=None) for name, site_times in times.items()}
