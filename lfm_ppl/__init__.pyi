@@ -23,6 +23,7 @@ from .forces import SquaredExponential as SquaredExponential
 from .forces import WienerVelocity as WienerVelocity
 from .inference.bind import bind as bind
 from .inference.bound_model import BoundModel as BoundModel
+from .inference.constrained_likelihood import ConstrainedLikelihood as ConstrainedLikelihood
 from .inference.handlers.fixing import fix as fix
 from .inference.handlers.on_latent_grid import on_latent_grid as on_latent_grid
 from .inference.kernels.elliptical_slice import EllipticalSlice as EllipticalSlice

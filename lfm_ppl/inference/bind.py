@@ -10,10 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lfm_ppl.filtering.arguments import check_observations
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.traced_model import traced_model
+from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.utils import checks
 
 
@@ -111,7 +109,7 @@ def bind(model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y: ArrayLi
     times, values = _arrays_by_site(times, y) if is_by_site else _arrays(times, y)
     columns = jax.tree.map(lambda y, times: y[:, None] if y.ndim == times.ndim == 1 else y, values, times)
     try:
-        traced, data = traced_model(model, (times, columns), keywords, "lfm.bind")
+        bound = bind_arguments(model, (times, columns), keywords)
     except (IndexError, KeyError) as error:
         # A dict without a site that the model reads, or an array in the place of a dict.
         is_missing = is_by_site and isinstance(error, KeyError) and error.args[0] not in values
@@ -120,9 +118,8 @@ def bind(model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y: ArrayLi
         entry = repr(error.args[0]) if is_missing else '"y"'
         raise ValueError(f"the model reads times or y by the name of a site, and there is no entry {entry}; pass dicts "
                          f"by site, in lfm.fit {{{entry}: (times, y), ...}}.") from error
-    bound = BoundModel(traced, data)
     if is_by_site and not bound.is_by_site:
-        sites = ", ".join(site.name for site in traced.likelihoods) or "none"
+        sites = ", ".join(site.name for site in bound.traced.likelihoods) or "none"
         raise ValueError(f"the likelihood sites of the model are {sites}, and there are data of {', '.join(values)}: "
                          "pass {name: (times, y), ...} with all sites, and write numpyro.sample(name, "
                          "lfm.MarginalLikelihood(system, times[name]), obs=y[name]) in model(times, y).")
@@ -156,15 +153,10 @@ def _check_data(bound: BoundModel, values: jax.Array) -> None:
         raise ValueError(f"the model does not use the data: its likelihood site {name!r} is not observed. {remedy}")
     if name in bound.traced.sites_of_times:
         raise ValueError(f"the likelihood site {name!r} observes the times, not the data. {remedy}")
-    if bound.is_by_site and name in bound.traced.sites_of_other_data:
+    if bound.is_by_site and name in bound.traced.sites_of_other_data(bound.constants):
         raise ValueError(f"the likelihood site {name!r} observes other data than those that were passed. {remedy}")
-    distribution = bound.site.distribution
     try:
-        if isinstance(distribution, Panel):
-            distribution.checked(values)
-        else:
-            rows, outputs = distribution.event_shape
-            check_observations(values, rows, outputs, model=distribution.model)
+        bound.site.distribution.checked(values)
     except ValueError as error:
         raise ValueError(f"site {name!r}: {error}" if bound.is_by_site else str(error)) from None
 
@@ -180,4 +172,6 @@ def bind_arguments(model: Callable, arguments: tuple, keywords: Mapping[str, Any
         keywords: its keyword arguments.
         caller: name of the calling function, for messages.
     """
-    return BoundModel(*traced_model(model, arguments, keywords, caller))
+    if isinstance(model, SharedModel):
+        return BoundModel.of(model.fn, arguments, keywords, caller, model.programs)
+    return BoundModel.of(model, arguments, keywords, caller)

@@ -1,11 +1,10 @@
 """A NumPyro model with its times and data bound: its log posterior as a plain function, compiled once.
 
-1. `bind` checks times and data and runs the model (`TracedModel`).
-2. Methods of `BoundModel` trace a function of z and y when first called, and keep it in the traced model.
-3. Data are an argument of each function, so that data sets of one shape share it. Times, known inputs and other real
-   arrays are arguments of each `program`, so that models of one structure have programs of one text, which are
-   compiled once (`lfm_ppl.utils.programs`).
-4. A model that needs the values of its data gets None as argument: its data are constants of the program.
+1. `bind` checks times and data and runs the model (`lfm_ppl.inference.trace`), which gives a `Problem`: data, times,
+   known inputs and time grids.
+2. Methods of `BoundModel` are functions of z and a problem, traced when first called and kept by name. Models of one
+   structure have programs of one text, which are compiled once (`lfm_ppl.utils.programs`).
+3. What a model needs the values of is a constant of its programs: it belongs to the structure of the problem.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
-from numpyro.infer import init_to_median
+from numpyro.infer import init_to_median, init_to_sample
 
 from lfm_ppl.filtering.breakdown import warn_of_iterations
 from lfm_ppl.filtering.filter import FilterResult
@@ -25,12 +24,12 @@ from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.stiffness import ExplicitSteps, long_step_message, warn_of_message
 from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.handlers.settings import approximate
+from lfm_ppl.inference.likelihood import Likelihood
 from lfm_ppl.inference.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood, single_site
-from lfm_ppl.inference.model_arguments import ModelArguments, signature
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
-from lfm_ppl.inference.traced_model import TracedModel
+from lfm_ppl.inference.problem import Partition, Problem, signature
+from lfm_ppl.inference.trace import Programs, TracedModel, trace_model
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.random_keys import split_keys
@@ -38,8 +37,15 @@ from lfm_ppl.utils.random_keys import split_keys
 _FORWARD_MODE_LIMIT = 3
 """Largest number of unconstrained parameters for which forward-mode gradients are faster."""
 
+_SITEWISE_STRATEGIES = (init_to_median, init_to_sample)
+"""Initialisation strategies that depend on a site alone, so that they can be compiled."""
+
 _ATTEMPTS = 20
 """Points that are drawn in the search for one of finite density."""
+
+
+class StartError(ValueError):
+    """No point of finite density was found to start from."""
 
 
 class BoundModel:
@@ -62,30 +68,48 @@ class BoundModel:
     the site, densities and parameters to the whole model.
 
     Attributes:
-        model_data: the data of all sites.
         names: names of the d unconstrained coordinates: sites sorted by name, elements in C order.
         size: d.
         sites: names of the latent sites.
         model: the NumPyro model.
         traced: the model without its data.
+        problem: data, times and inputs as the argument of each program.
+        constants: the same with times and inputs as constants, for functions that need their values.
     """
 
-    def __init__(self, traced: TracedModel, y: ArrayLike, selected: str | None = None) -> None:
-        self.traced = traced
+    def __init__(self, traced: TracedModel, constants: Problem, problem: Problem, programs: Programs,
+                 selected: str | None = None) -> None:
+        self.traced, self.constants, self.problem, self.programs = traced, constants, problem, programs
         self.names, self.size, self.sites, self.model = traced.names, traced.size, traced.sites, traced.model
-        self.model_data: Any = y
         self._selected = selected
         self._trace: dict[str, Any] | None = None
+        self._modifications: dict[Hashable, BoundModel] = {}
+
+    @classmethod
+    def of(cls, model: Callable, arguments: tuple, keywords: Mapping[str, Any], caller: str,
+           programs: Programs | None = None) -> BoundModel:
+        """Bind a NumPyro model to its arguments, the last of which is its data; see `trace_model`."""
+        programs = programs or Programs()
+        return cls(*trace_model(model, arguments, keywords, caller, programs), programs)
+
+    @property
+    def model_data(self) -> Any:
+        """The data of all sites."""
+        return self.problem.observations
 
     @property
     def y(self) -> Any:
         """The data: of all sites, or of the selected site."""
-        return self.model_data if self._selected is None else self.model_data[self._selected]
+        return self._of_selected(self.model_data)
+
+    def _of_selected(self, data: Any) -> Any:
+        return data if self._selected is None else data[self._selected]
 
     @property
     def is_by_site(self) -> bool:
         """Whether times and data are dictionaries by name of a likelihood site."""
-        times = self.traced.arguments[0] if self.traced.arguments else None
+        arguments, _ = self.constants.call()
+        times = arguments[0] if arguments else None
         return isinstance(times, Mapping) and set(times) == {site.name for site in self.traced.likelihoods}
 
     @property
@@ -97,12 +121,13 @@ class BoundModel:
         """
         if not self.is_by_site or self._selected is not None:
             return {self.site.name: self}
-        return {name: BoundModel(self.traced, self.model_data, name) for name in self.traced.arguments[0]}
+        return {name: BoundModel(self.traced, self.constants, self.problem, self.programs, name)
+                for name in self.constants.call()[0][0]}
 
     @property
     def times(self) -> Any:
         """Times of the observations, (T,), or (B, T) for a panel whose series have different times; a dict by site."""
-        times = self.traced.arguments[0]
+        times = self.constants.call()[0][0]
         if self.is_by_site:
             return times if self._selected is None else times[self._selected]
         return np.asarray(times, float)
@@ -137,35 +162,42 @@ class BoundModel:
         Raises:
             ValueError: another shape; an infinite entry.
         """
-        traced, y = self.traced, self._checked(self._of_all_sites(y))
-        if traced.data_index is None:
-            traced = TracedModel(traced.model, (*traced.arguments[:-1], y), None, traced.keywords, y, traced.caller)
-        return BoundModel(traced, y, self._selected)
+        y = self._checked(self._of_all_sites(y))
+        if self.problem.data is not None:
+            return BoundModel(self.traced, self.constants.with_data(y), self.problem.with_data(y), self.programs,
+                              self._selected)
+        arguments, keywords = self.constants.call()
+        bound = BoundModel.of(self.model, (*arguments[:-1], y), keywords, self.traced.caller, self.programs)
+        bound._selected = self._selected
+        return bound
 
-    def data(self, y: ArrayLike | Mapping[str, Any] | None = None) -> Any:
+    def data(self, y: ArrayLike | Mapping[str, Any] | Problem | None = None) -> Any:
         """Return the data: ``y`` after checking it, or the bound data; where a site is selected, the part of the site.
 
         Raises:
             ValueError: another shape, an infinite entry; the model needs the values of its data.
         """
-        data = self._all_data(y)
-        return data if self._selected is None else data[self._selected]
+        return self._of_selected(self.problem_of(y).observations)
+
+    def problem_of(self, y: ArrayLike | Mapping[str, Any] | Problem | None = None) -> Problem:
+        """Return the problem with these data, after checking them; a `Problem` as it is."""
+        return self._with_data(self.problem, y)
+
+    def _with_data(self, problem: Problem, y: Any) -> Problem:
+        if isinstance(y, Problem):
+            return y
+        y = self._of_all_sites(y)
+        if y is None or y is self.model_data:
+            return problem
+        if problem.data is None:
+            raise ValueError("the model needs the values of its data, so that they cannot be an argument of compiled "
+                             "code; bind the model to these data, bound.with_data(y).")
+        return problem.with_data(self._checked(y))
 
     def _of_all_sites(self, y: Any) -> Any:
         """Return data of all sites; data of the selected one replace its bound data."""
         is_of_one = self._selected is not None and y is not None and not isinstance(y, Mapping)
         return {**self.model_data, self._selected: y} if is_of_one else y
-
-    def _all_data(self, y: Any = None) -> Any:
-        if isinstance(y, ModelArguments):
-            return y.data
-        y = self._of_all_sites(y)
-        if y is None or y is self.model_data:
-            return self.model_data
-        if self.traced.data_index is None:
-            raise ValueError("the model needs the values of its data, so that they cannot be an argument of compiled "
-                             "code; bind the model to these data, bound.with_data(y).")
-        return self._checked(y)
 
     def _checked(self, y: Any) -> Any:
         shapes, expected = (jax.tree.map(np.shape, value) for value in (y, self.model_data))
@@ -177,20 +209,6 @@ class BoundModel:
             if (values := checks.concrete(leaf)) is not None and np.isinf(values).any():
                 raise ValueError("y has infinite entries; use NaN for a missing entry.")
         return y
-
-    @property
-    def argument(self) -> Any:
-        """The argument of functions `compiled` for these times: the data, or None where they are constants."""
-        return None if self.traced.data_index is None else self.model_data
-
-    @property
-    def arguments(self) -> Any:
-        """The argument of each `program`: data, times and inputs; None where they are constants of the program."""
-        return self.traced.program_arguments(self.model_data)
-
-    def _arguments(self, y: Any) -> Any:
-        # `_all_data` raises an error where the data are constants and others are given.
-        return y if isinstance(y, ModelArguments) else self.traced.program_arguments(self._all_data(y))
 
     def _position(self, z: Any) -> jax.Array:
         if np.shape(z) != (self.size,):
@@ -208,7 +226,7 @@ class BoundModel:
             y: data of the shape that was bound; None: the bound data.
         """
         run = self.program("log density", lambda: Program(self._target(True)))
-        return run(self._position(z), self._arguments(y))
+        return run(self._position(z), self.problem_of(y))
 
     def log_density_gradient(self, z: ArrayLike, y: ArrayLike | None = None) -> tuple[jax.Array, jax.Array]:
         """Return the log density and its gradient (d,); arguments as `log_density`."""
@@ -218,7 +236,7 @@ class BoundModel:
         """Return the compiled function from z and y to the log density and its gradient, by either mode."""
         run = self.program(("gradient", jacobian, forward_mode),
                            lambda: Program(value_and_gradient(self._target(jacobian), forward_mode)))
-        return lambda z, y: run(z, self._arguments(y))
+        return lambda z, y: run(z, self.problem_of(y))
 
     def log_likelihood(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
         """Return log p(y | T(z)), summed over all sites and the series of a panel; arguments as `log_density`."""
@@ -227,14 +245,14 @@ class BoundModel:
             return jnp.stack([site.distribution.log_prob(site.observed).sum() for site in sites]).sum()
 
         run = self.program("log likelihood", lambda: Program(log_likelihood))
-        return run(self._position(z), self._arguments(y))
+        return run(self._position(z), self.problem_of(y))
 
     def log_prior(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
         """Return the log prior density of the unconstrained parameters, Jacobian included."""
         traced = self.traced
         run = self.program("log prior", lambda: Program(
             lambda z, y: -traced.potential(z, y, remove_likelihood)))
-        return run(self._position(z), self._arguments(y))
+        return run(self._position(z), self.problem_of(y))
 
     def site_log_priors(self, values: Mapping[str, Any], y: Any = None) -> dict[str, jax.Array]:
         """Return the log prior density of each site, conditional on the sites that it depends on.
@@ -243,7 +261,7 @@ class BoundModel:
             values: site name -> value.
             y: as in `log_density`.
         """
-        trace = self.traced.trace_at(values, self._data_or_arguments(y))
+        trace = self.trace_at(values, y)
         densities = {name: trace[name]["fn"].log_prob(trace[name]["value"]).sum() for name in self.sites}
         return {name: density if (scale := trace[name]["scale"]) is None else scale * density
                 for name, density in densities.items()}
@@ -272,7 +290,7 @@ class BoundModel:
                                lambda: Program(jax.jacfwd(first_derivative(self._target(jacobian)))))
 
         def minus_hessian(z: Any) -> Any:
-            return -hessian(jnp.asarray(z, float), self.arguments)
+            return -hessian(jnp.asarray(z, float), self.problem)
 
         return Objective(minus, minus_hessian)
 
@@ -292,7 +310,7 @@ class BoundModel:
             z: (d,).
             y: as in `log_density`.
         """
-        return -self.traced.potential(jnp.asarray(z, float), self._all_data(y), handler)
+        return -self.traced.potential(jnp.asarray(z, float), self._with_data(self.constants, y), handler)
 
     # --- parameters
 
@@ -303,13 +321,13 @@ class BoundModel:
     def constrain(self, z: ArrayLike, y: ArrayLike | None = None) -> dict[str, jax.Array]:
         """Return site name -> value of the latent and the deterministic sites at z (d,)."""
         run = self.program("constrain", lambda: Program(self.traced.constrain))
-        return run(self._position(z), self._arguments(y))
+        return run(self._position(z), self.problem_of(y))
 
     def constrain_draws(self, z: ArrayLike) -> dict[str, np.ndarray]:
         """Return site name -> values (..., *shape) at draws z (..., d)."""
         traced = self.traced
         run = self.program("constrain draws", lambda: Program(jax.vmap(traced.constrain, in_axes=(0, None))))
-        values = run(jnp.asarray(z, float).reshape(-1, self.size), self.arguments)
+        values = run(jnp.asarray(z, float).reshape(-1, self.size), self.problem)
         return {name: np.asarray(value).reshape(*np.shape(z)[:-1], *value.shape[1:]) for name, value in values.items()}
 
     def unconstrain(self, values: Mapping[str, Any]) -> jax.Array:
@@ -327,7 +345,7 @@ class BoundModel:
         for name in self.sites:
             if name not in values:
                 raise ValueError(f"values has no value of {name!r}; it needs one for each of {', '.join(self.sites)}.")
-        z, trace = self.traced.unconstrain(values, self.model_data)
+        z, trace = self.traced.unconstrain(values, self.constants)
         for name, site in trace.items():
             expected = tuple(site["fn"].batch_shape) + tuple(site["fn"].event_shape)
             if np.shape(values[name]) != expected:
@@ -339,7 +357,13 @@ class BoundModel:
 
     def draw(self, key: jax.Array, strategy: Callable = init_to_median) -> np.ndarray:
         """Return a point z (d,) by a NumPyro initialisation strategy."""
-        return np.asarray(self.traced.draw(self.model_data, key, strategy), float)
+        traced, problem = self.traced, self.problem
+        if strategy not in _SITEWISE_STRATEGIES or problem.data is None or checks.traced(problem):
+            return np.asarray(traced.draw(key, self.constants, strategy), float)
+        # With many data sets of one shape, running the model in Python would take longer than everything else.
+        run = self.program(("draw", strategy), lambda: Program(
+            lambda key, problem: traced.draw(key, problem, strategy)))
+        return np.asarray(run(key, problem), float)
 
     def start(self, key: jax.Array, strategy: Callable = init_to_median, attempts: int = _ATTEMPTS,
               evaluate: Callable[[np.ndarray], Any] | None = None) -> np.ndarray:
@@ -352,7 +376,7 @@ class BoundModel:
             evaluate: function of z; None: the log density and its gradient.
 
         Raises:
-            ValueError: no point has finite values.
+            StartError: no point has finite values.
         """
         keys = split_keys(key, attempts)
         for attempt in range(attempts):
@@ -360,7 +384,7 @@ class BoundModel:
             values = jax.tree.leaves((evaluate or self.log_density_gradient)(z))
             if all(np.all(np.isfinite(value)) for value in values):
                 return z
-        raise ValueError(f"found no point of finite density to start from in {attempts} attempts. Give a starting "
+        raise StartError(f"found no point of finite density to start from in {attempts} attempts. Give a starting "
                          "point, or check the model: its log density or the gradient of it is not finite.")
 
     def trace(self) -> dict[str, Any]:
@@ -368,31 +392,33 @@ class BoundModel:
         if self._trace is not None:
             return self._trace
         with jax.ensure_compile_time_eval():  # the call may come from compiled code
-            trace = self.traced.trace(self.model_data)
+            trace = self.traced.trace(self.constants)
         if not checks.traced(self.model_data):
             self._trace = trace
         return trace
 
+    def trace_at(self, values: Mapping[str, Any], y: Any = None) -> dict[str, Any]:
+        """Return NumPyro's trace of the model at values of its sites; ``y`` as in `log_density`."""
+        return self.traced.trace_at(values, self._with_data(self.constants, y))
+
     # --- the filter and the smoother
 
-    def likelihood(self, z: ArrayLike | Mapping[str, Any], y: ArrayLike | None = None) -> SeriesLikelihood | Panel:
+    def likelihood(self, z: ArrayLike | Mapping[str, Any],
+                   y: ArrayLike | Problem | None = None) -> Likelihood:
         """Return the likelihood at parameters, in compiled code too.
 
         Args:
             z: (d,), or site name -> value.
             y: as in `log_density`; the likelihood itself does not hold data.
         """
-        return self._site_at(z, self._data_or_arguments(y)).distribution
+        return self._site_at(z, self._with_data(self.constants, y)).distribution
 
-    def _data_or_arguments(self, y: Any) -> Any:
-        return y if isinstance(y, ModelArguments) else self._all_data(y)
-
-    def _site_at(self, z: Any, y: Any) -> LikelihoodSite:
+    def _site_at(self, z: Any, problem: Problem) -> LikelihoodSite:
         """Return the likelihood site at parameters, with its observations."""
         traced = self.traced
-        values = z if isinstance(z, Mapping) else traced.constrain(jnp.asarray(z, float), y)
+        values = z if isinstance(z, Mapping) else traced.constrain(jnp.asarray(z, float), problem)
         values = {name: values[name] for name in self.sites if name in values}
-        return likelihood_site(traced.with_times(y), *traced.call(y), traced.key, values, self._selected)
+        return likelihood_site(traced.with_times(problem), *problem.call(), traced.key, values, self._selected)
 
     def filter(self, z: ArrayLike | Mapping[str, Any], y: ArrayLike | None = None) -> FilterResult:
         """Return the result of the Gaussian filter at parameters z (d,), or site name -> value; see `lfm_ppl.filter`.
@@ -411,7 +437,7 @@ class BoundModel:
             site = self._site_at(z, y)
             return site.distribution.filter(site.observed)
 
-        result = self.program("filter", lambda: Program(run))(_as_arrays(z), self._arguments(y))
+        result = self.program("filter", lambda: Program(run))(_as_arrays(z), self.problem_of(y))
         self._warn_of_long_steps(result.log_likelihood, z, y)
         return result
 
@@ -448,9 +474,7 @@ class BoundModel:
             requested_times: (K,), of a single series; None: the times of the data.
         """
         def steps(site: LikelihoodSite, times: Any) -> Any:
-            if isinstance(site.distribution, Panel):
-                return site.distribution.mapped(lambda series, y: series.explicit_steps(y), site.observed)
-            return site.distribution.explicit_steps(site.observed, times)
+            return site.distribution.mapped(lambda series, y: series.explicit_steps(y, times), site.observed)
 
         return self._run_at("explicit steps", steps, z, y, requested_times)
 
@@ -458,15 +482,18 @@ class BoundModel:
                 requested_times: Any) -> Any:
         """Return a function, compiled, of the likelihood site at z and of requested times (K,) or None."""
         times = None if requested_times is None else np.atleast_1d(np.asarray(requested_times, float))
+        problem, requested = self.problem_of(y), self.requested(times)
 
-        def run(z: Any, y: Any) -> Any:
-            return function(self._site_at(z, y), times)
+        def run(z: Any, problem: Problem, requested: Partition) -> Any:
+            return function(self._site_at(z, problem), requested.value)
 
-        if times is None:
-            return self.program(name, lambda: Program(run))(_as_arrays(z), self._arguments(y))
-        data = self._all_data(y)
-        return self.compiled((name, signature(times)), lambda: Program(run))(
-            _as_arrays(z), None if self.argument is None else data)
+        return self.program(name, lambda: Program(run), problem)(_as_arrays(z), problem, requested)
+
+    def requested(self, times: np.ndarray | None) -> Partition:
+        """Return requested times (K,) as an argument of a program: their layout where grids are arguments, too."""
+        if times is None or not self.problem.has_traced_inputs:
+            return Partition.of_constants(times)
+        return Partition.of_layout(self.traced.lay_out(self.site.name, self.constants, times))
 
     def _warn_of_long_steps(self, log_likelihood: Any, z: Any, y: Any, requested_times: Any = None) -> None:
         """Warn where a step is too long for a fast decay; nothing happens in compiled code."""
@@ -514,36 +541,29 @@ class BoundModel:
         return self._modified(("approximate", signature(settings)), modify)
 
     def _modified(self, name: tuple[str, Hashable], modify: Callable[[Callable], Callable]) -> BoundModel:
-        traced = self.traced
+        key = self._selected, *name
+        if key in self._modifications:
+            return self._modifications[key]
+        programs = Programs() if name[1] is None else self.programs.of_modified(key)
+        modified = BoundModel.of(modify(self.model), *self.constants.call(), self.traced.caller, programs)
+        modified._selected = self._selected
+        if name[1] is not None and not checks.traced(self.problem):
+            self._modifications[key] = modified
+        return modified
 
-        def trace_modified() -> TracedModel:
-            modified = TracedModel(modify(traced.model), traced.arguments, traced.data_index, traced.keywords,
-                                   self.model_data, traced.caller)
-            identity = traced.identity, self._selected, name
-            return modified.take_inputs_as_arguments(identity) if is_cached else modified
-
-        with jax.ensure_compile_time_eval():  # the call may come from compiled code
-            is_cached = name[1] is not None and not checks.traced(self.model_data)
-            modified = traced.memoized((self._selected, *name), trace_modified) if is_cached else trace_modified()
-        return BoundModel(modified, self.model_data, self._selected)
-
-    def compiled(self, name: Hashable, make: Callable[[], Callable]) -> Callable:
-        """Return the function of this name, for any data, made at the first call for these times and inputs.
+    def program(self, name: Hashable, make: Callable[[], Any], problem: Problem | None = None) -> Any:
+        """Return the function of this name, made at the first call for problems of this structure.
 
         Args:
             name: everything that the function depends on besides the model and its arguments.
-            make: returns the function; the data must be an argument of it.
+            make: returns the function, which takes a problem as an argument.
+            problem: that problem; None: `problem`.
         """
-        return self.traced.memoized((self._selected, name), make)
-
-    def program(self, name: Hashable, make: Callable[[], Any]) -> Any:
-        """Return the function of this name, for any data, times and inputs; made at the first call.
-
-        Args:
-            name: everything that the function depends on besides the model and its arguments.
-            make: returns the function, which takes `arguments` and takes data, times and inputs from there only.
-        """
-        return self.traced.program((self._selected, name), make)
+        structure = jax.tree.structure(self.problem if problem is None else problem)
+        key = self._selected, name, structure
+        if key not in self.programs.by_name:
+            self.programs.by_name[key] = make()
+        return self.programs.by_name[key]
 
 
 def _as_arrays(z: Any) -> Any:

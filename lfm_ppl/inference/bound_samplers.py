@@ -17,8 +17,8 @@ from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, par
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.kernels.robust_metropolis import robust_metropolis
 from lfm_ppl.inference.laplace_start import Laplace
-from lfm_ppl.inference.model_arguments import signature
 from lfm_ppl.inference.nuts import NUTSState, nuts, nuts_options
+from lfm_ppl.inference.problem import Problem, signature
 
 _SLOW_WARMUP_HINT = (
     "this warm-up is slow, and the time left may still grow. From the posterior mode, with the covariance "
@@ -31,13 +31,13 @@ class BoundSampler:
 
     Attributes:
         bound: the model and its data.
-        algorithm: the Markov chain; its data are `argument`.
+        algorithm: the Markov chain; its data are `problem`.
         identity: key of the compiled programs; it holds everything that the algorithm depends on besides the model.
         evaluate: from z (d,) to the log density and, if the algorithm uses it, the gradient (d,), else zeros.
         tuning: arrays for ``algorithm.init``, an argument of the compiled program.
         describe: from the state of all chains to a short text for the progress display.
         slow_warmup_hint: advice during a long warm-up; empty where there is none.
-        needs_times: whether the algorithm needs the values of times and inputs, so that its programs are for these.
+        problem: data, times and inputs as the algorithm takes them.
     """
 
     bound: BoundModel
@@ -46,18 +46,12 @@ class BoundSampler:
     evaluate: Callable[[Any], tuple[Any, Any]]
     tuning: Any
     describe: Callable[[Any], str]
+    problem: Problem
     slow_warmup_hint: str = ""
-    needs_times: bool = False
 
-    @property
-    def argument(self) -> Any:
-        """The data argument of the algorithm."""
-        return self.bound.argument if self.needs_times else self.bound.arguments
-
-    def compiled(self, name: Hashable, make: Callable[[], Callable]) -> Callable:
+    def program(self, name: Hashable, make: Callable[[], Callable]) -> Callable:
         """Return the compiled function of this name, made at the first call."""
-        store = self.bound.compiled if self.needs_times else self.bound.program
-        return store((name, self.identity), make)
+        return self.bound.program((name, self.identity), make, self.problem)
 
 
 def nuts_sampler(bound: BoundModel, num_warmup: int, options: Mapping[str, Any],
@@ -84,7 +78,8 @@ def nuts_sampler(bound: BoundModel, num_warmup: int, options: Mapping[str, Any],
     return BoundSampler(
         bound, nuts(bound, num_warmup, completed),
         ("nuts", num_warmup, laplace is not None, signature(completed) or object()), evaluate,
-        jax.tree_util.tree_map(jnp.asarray, laplace), describe, _SLOW_WARMUP_HINT if has_default_mass else "")
+        jax.tree_util.tree_map(jnp.asarray, laplace), describe, bound.problem,
+        _SLOW_WARMUP_HINT if has_default_mass else "")
 
 
 def ram_sampler(bound: BoundModel, num_warmup: int, kernel: RAM) -> BoundSampler:
@@ -108,8 +103,10 @@ def _random_walk(bound: BoundModel, algorithm: SamplingAlgorithm, identity: Hash
     def describe(state: Any) -> str:
         return _step_size_and_acceptance(state.step_size, state.mean_accept_prob)
 
+    # A particle filter needs the values of the times.
+    problem = bound.constants if isinstance(kernel, ParticleMarginalRAM) else bound.problem
     return BoundSampler(bound, algorithm, identity, evaluate, jnp.asarray(kernel.initial_factor(bound.size)), describe,
-                        needs_times=isinstance(kernel, ParticleMarginalRAM))
+                        problem)
 
 
 def _potential_at(bound: BoundModel) -> Callable[[Any], Callable[[Any], jax.Array]]:

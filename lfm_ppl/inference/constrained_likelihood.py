@@ -27,12 +27,14 @@ from lfm_ppl.constrained.full_information import check_settings
 from lfm_ppl.filtering.backward import backward
 from lfm_ppl.filtering.ep.evidence import leave_one_out
 from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.intervals import RUNGE_KUTTA
 from lfm_ppl.filtering.moments import Record
 from lfm_ppl.filtering.problem import at_intervals
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import Sites
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
+from lfm_ppl.inference.marginal_likelihood import CONSTRAINTS, MarginalLikelihood
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood, check_model, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import noisy_observation
@@ -49,9 +51,8 @@ class ConstrainedLikelihood(SeriesLikelihood):
 
         log p(y | c) = log Z(y, c) - log Z(c),
 
-    by expectation propagation, corrected by weighted trajectories. It is -inf where expectation propagation does not
-    converge. `lfm_ppl.MarginalLikelihood` returns it for ``lower``, ``upper`` or ``constraints``, and documents the
-    arguments.
+    the density of the data given that the constraints are respected: by expectation propagation, corrected by weighted
+    trajectories. It is -inf where expectation propagation does not converge.
 
     Args:
         model: the latent force model, with Gaussian observations.
@@ -60,19 +61,25 @@ class ConstrainedLikelihood(SeriesLikelihood):
         steps: integration steps between two rows of the grid or the data.
         lower: name of a state, force or output -> its lower bound.
         upper: the same for upper bounds.
-        constraints: functions c(x, u, t), feasible where >= 0.
-        grid: times at which the constraints hold, or their number.
-        draws: even number of trajectories; 0: expectation propagation alone.
+        constraints: functions c(x, u, t), feasible where >= 0; with ``draws``, linear in x and u.
+        grid: (K,) times at which the constraints hold, or how many at equal distances from the initial time to the last
+            observation. By default the initial time and the times of the observations, and between those that are
+            further apart than 1/20 of the record times at equal distances; 100 at equal distances where observations
+            have more times. The cost is that of some tens of smoother passes over it, and the error of the importance
+            sampling grows with the number of rows.
+        draws: number of trajectories, an even one; 0: by expectation propagation alone, which may be off by .1 on a
+            coarse grid, and by .5 on a dense one. They have the same random numbers for all parameters, so that the
+            log density has no noise, but an error that varies slowly with the parameters.
 
     Raises:
-        ValueError, TypeError: as `lfm_ppl.MarginalLikelihood`.
+        ValueError, TypeError: as `lfm_ppl.MarginalLikelihood`; no constraint, or an observation family.
 
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
         ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
-        >>> lfm.MarginalLikelihood(model, jnp.arange(3.0), lower={"u": 0.0}).constraints_in_words
+        >>> lfm.ConstrainedLikelihood(model, jnp.arange(3.0), lower={"u": 0.0}).constraints_in_words
         'u >= 0 at 21 times'
     """
 
@@ -83,10 +90,13 @@ class ConstrainedLikelihood(SeriesLikelihood):
                  lower: Mapping[str, Any] | None = None, upper: Mapping[str, Any] | None = None,
                  constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), grid: Any = None,
                  draws: int = 256):
+        check_model(model)
         self.lower, self.upper = (None if bounds is None else dict(bounds) for bounds in (lower, upper))
         self.constraints = (constraints,) if callable(constraints) else tuple(constraints or ())
         self.grid = grid if grid is None or is_count(grid) else tuple(np.atleast_1d(np.asarray(grid, float)).tolist())
         self.draws = draws
+        if not (self.lower or self.upper or self.constraints):
+            raise ValueError("give lower, upper or constraints; without any the likelihood is lfm.MarginalLikelihood.")
         check_settings(model, 1.0, 1)
         if draws != 0:
             checks.positive_integer("draws", draws)
@@ -98,7 +108,7 @@ class ConstrainedLikelihood(SeriesLikelihood):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Arguments of `lfm_ppl.MarginalLikelihood` besides model and times."""
+        """Arguments besides model and times."""
         return {name: getattr(self, name) for name in ("rule", "steps", "lower", "upper", "constraints", "grid",
                                                        "draws")}
 
@@ -193,6 +203,30 @@ class ConstrainedLikelihood(SeriesLikelihood):
         sites = Sites(*(a[data, :outputs] for a in fixed_point.sites))
         value = leave_one_out(at_data, sites, propagated.entries[data, :outputs])
         return jnp.where(fixed_point.converged, value, -jnp.inf)
+
+
+def likelihood_with(model: LatentForceModel, times: Any, settings: Mapping[str, Any]) -> SeriesLikelihood:
+    """Return the likelihood of one series with settings by name, under constraints where there are any.
+
+    Raises:
+        ValueError: a setting of the filter that a likelihood under constraints does not have.
+    """
+    settings = dict(settings)
+    constraints = {name: settings.pop(name) for name in CONSTRAINTS if name in settings}
+    if not any(constraints.get(name) for name in ("lower", "upper", "constraints")):
+        return MarginalLikelihood(model, times, **settings)
+    rule, steps = settings.pop("rule", None), settings.pop("steps", 10)
+    for name in ("max_step", "tolerance"):
+        if settings.get(name) is not None:
+            raise ValueError(f"{name} is not supported under constraints, which add rows to the grid; raise steps.")
+    if (method := settings.get("method", RUNGE_KUTTA)) != RUNGE_KUTTA:
+        raise ValueError(f"method={method!r} is not supported under constraints; leave method out.")
+    if settings.get("iterations"):
+        raise ValueError("under constraints a non-linear model is always linearised about smoothed moments. Leave "
+                         "iterations out.")
+    if settings.get("sites") is not None:
+        raise ValueError("sites are for an observation family without constraints. Leave out sites.")
+    return ConstrainedLikelihood(model, times, rule, steps, **constraints)
 
 
 def _format_bound(value: Any) -> str:

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import jax
 from numpyro import handlers
 
-from lfm_ppl.filtering.grid_layout import GridLayout
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.likelihood import Likelihood
+from lfm_ppl.inference.problem import SiteTimes
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.utils import checks
 
@@ -25,23 +25,18 @@ class LikelihoodSite(NamedTuple):
     """
 
     name: str
-    distribution: SeriesLikelihood | Panel
+    distribution: Likelihood
     observed: Any = None
 
     @property
     def example(self) -> SeriesLikelihood:
         """The distribution of one series."""
-        if isinstance(self.distribution, Panel):
-            return self.distribution.first
-        return self.distribution
+        return self.distribution.first
 
     @property
     def members(self) -> list[SeriesLikelihood]:
         """The distributions of all series."""
-        distribution = self.distribution
-        if isinstance(distribution, Panel):
-            return [distribution.series(index) for index in range(distribution.batch_shape[0])]
-        return [distribution]
+        return self.distribution.members
 
 
 def likelihood_site(model: Callable, arguments: tuple, keywords: Mapping[str, Any], key: jax.Array,
@@ -61,9 +56,9 @@ def likelihood_sites(trace: Mapping[str, Any]) -> list[LikelihoodSite]:
     for name, site in trace.items():
         distribution = site.get("fn")
         # Masks and expansions wrap the distribution.
-        while hasattr(distribution, "base_dist") and not isinstance(distribution, (SeriesLikelihood, Panel)):
+        while hasattr(distribution, "base_dist") and not isinstance(distribution, Likelihood):
             distribution = distribution.base_dist
-        if isinstance(distribution, (SeriesLikelihood, Panel)):
+        if isinstance(distribution, Likelihood):
             sites.append(LikelihoodSite(name, distribution, site["value"]))
     return sites
 
@@ -86,18 +81,6 @@ def single_site(sites: Sequence[LikelihoodSite], name: str | None = None) -> Lik
                      f"model(times, y) with dicts; of a bound model take bound.site_models[{sites[0].name!r}].")
 
 
-class SiteTimes(NamedTuple):
-    """Times of a likelihood site that do not depend on the parameters.
-
-    Attributes:
-        times: (T,), or (B, T) for a panel.
-        layout: layout of the time grid; None where the likelihood lays it out itself.
-    """
-
-    times: Any
-    layout: GridLayout | None = None
-
-
 class replace_times(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
     """Effect handler that gives each likelihood its times, where the model's arithmetic or compiled code traces them.
 
@@ -110,7 +93,7 @@ class replace_times(LikelihoodHandler):  # noqa: N801 (an effect handler, named 
         self.times = times
         super().__init__(fn)
 
-    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> Any:
         """Return the likelihood at these times."""
         new: SiteTimes | None = self.times.get(site["name"])
         if new is None:
@@ -134,9 +117,9 @@ class record_likelihoods(LikelihoodHandler):  # noqa: N801 (an effect handler, s
     def begin(self) -> None:
         """Forget the likelihoods of the run before."""
         super().begin()
-        self.likelihoods: dict[str, SeriesLikelihood | Panel] = {}
+        self.likelihoods: dict[str, Likelihood] = {}
 
-    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> Any:
         """Store the likelihood and return an improper distribution."""
         self.likelihoods[site["name"]] = likelihood
         return super().replacement(likelihood, site)

@@ -75,9 +75,9 @@ class LogPosterior:
             batch: how many are computed at a time; a thousand no longer fit the CPU's cache, and take seven times as
                 long each.
         """
-        run = self.bound.compiled(("log densities of draws", self.names, batch), lambda: Program(
+        run = self.bound.program(("log densities of draws", self.names, batch), lambda: Program(
             lambda all_, y: jax.lax.map(lambda z: self.log_densities(z, y), all_, batch_size=batch)))
-        log_likelihood, log_prior = run(jnp.asarray(draws), y)
+        log_likelihood, log_prior = run(jnp.asarray(draws), self.bound.problem_of(y))
         return np.asarray(log_likelihood), np.asarray(log_prior)
 
     def objective(self, y: Any, prior: float = 1.0) -> Objective:
@@ -91,6 +91,7 @@ class LogPosterior:
             log_likelihood, log_prior = self.log_densities(z, y)
             return -log_likelihood - prior * log_prior
 
-        run = self.bound.compiled(("energy", self.names, self._forward_mode),
-                                  lambda: Program(value_and_gradient(energy, self._forward_mode)))
-        return Objective(lambda z: run(z, y, prior))
+        run = self.bound.program(("energy", self.names, self._forward_mode),
+                                 lambda: Program(value_and_gradient(energy, self._forward_mode)))
+        problem = self.bound.problem_of(y)
+        return Objective(lambda z: run(z, problem, prior))

@@ -24,7 +24,7 @@ import numpy as np
 from numpyro.infer import init_to_median, init_to_sample
 
 from lfm_ppl.inference.bind import bind_arguments
-from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.bound_model import BoundModel, StartError
 from lfm_ppl.inference.optimise import End, Minimum, Objective, newton, quasi_newton
 from lfm_ppl.utils import checks
 
@@ -213,7 +213,7 @@ def _starts(
         )
     starts = [start, *(_possible_start(model, value, k, init_to_sample, _ATTEMPTS) for k in keys)]
     if all(start is None for start in starts):
-        raise ValueError(
+        raise StartError(
             f"found no point of finite density in {restarts} x {_ATTEMPTS} draws from the prior. "
             "Give a starting point, init={'site': value}, or check the model: its log density is "
             "-inf or NaN."

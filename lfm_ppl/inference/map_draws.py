@@ -11,16 +11,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, cast
 
 import jax
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.utils.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
 from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.progress import Progress, Reporter
@@ -52,39 +49,20 @@ class BatchStore(Protocol):
         """Write all stored batches."""
 
 
-def map_series(distribution: SeriesLikelihood | Panel, function: Callable, *arguments: Any) -> Any:
-    """Return ``function(distribution, *arguments)``; for a panel, for each series, with the series as leading axis."""
-    if isinstance(distribution, Panel):
-        return distribution.mapped(function, *arguments)
-    return function(distribution, *arguments)
-
-
-@dataclass(frozen=True)
-class SharedFunction:
-    """A function of draws that is compiled once for all times and inputs of a model.
-
-    Attributes:
-        per_draw: maps site values, a random key, the model's ``arguments`` and further arguments to a pytree of arrays.
-        arguments: the further arguments, pytrees of arrays that depend on times and inputs.
-    """
-
-    per_draw: Callable
-    arguments: tuple = ()
-
-
-def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable | SharedFunction, draws: Mapping[str, Any],
-              key: jax.Array, *, rows: int | None = None, report: Reporter | None = None,
+def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, *,
+              arguments: Sequence[Any] = (), rows: int | None = None, report: Reporter | None = None,
               store: BatchStore | None = None) -> Any:
-    """Return ``per_draw(values, key, y)`` for all draws (S, ...).
+    """Return ``per_draw(values, key, *arguments)`` for all draws (S, ...).
 
     Args:
         bound: the model and its data y.
         name: name of the computation, or a tuple of it and all that ``per_draw`` depends on besides the model: the key
             of the compiled function.
-        per_draw: maps site values, a random key and the model's ``argument`` to a pytree of arrays, and is compiled for
-            the times and inputs of the model; or a `SharedFunction`.
+        per_draw: maps site values, a random key and the arguments to a pytree of arrays.
         draws: site name -> (S, ...).
         key: a JAX random key.
+        arguments: pytrees, of which the first is a `Problem`, ``bound.problem`` or ``bound.constants``; empty: the
+            former alone.
         rows: rows of the scan over time, which decide the size of a batch; None: one draw after another.
         report: target of the progress.
         store: stores the batches.
@@ -96,17 +74,14 @@ def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable | SharedF
     batch, parallel = _batch_size(count, rows, example.ssm.state_dim, is_vectorized)
 
     def sequential(draws: Any, keys: jax.Array, *arguments: Any) -> Any:
-        return jax.lax.map(lambda pair: function(*pair, *arguments), (draws, keys))
+        return jax.lax.map(lambda pair: per_draw(*pair, *arguments), (draws, keys))
 
     def by_fours(draws: Any, keys: jax.Array, *arguments: Any) -> Any:
-        return mapped(lambda draw, key: function(draw, key, *arguments), draws, keys, batch_size=BATCH_SIZE)
+        return mapped(lambda draw, key: per_draw(draw, key, *arguments), draws, keys, batch_size=BATCH_SIZE)
 
-    if isinstance(per_draw, SharedFunction):
-        function, compiled = per_draw.per_draw, bound.program
-        arguments = bound.arguments, *per_draw.arguments
-    else:
-        function, compiled, arguments = per_draw, bound.compiled, (bound.argument,)
-    run = compiled(("map draws", is_vectorized, name), lambda: Program(by_fours if is_vectorized else sequential))
+    arguments = arguments or (bound.problem,)
+    run = bound.program(("map draws", is_vectorized, name), lambda: Program(by_fours if is_vectorized else sequential),
+                        arguments[0])
     keys = split_keys(key, count)
 
     def batch_arguments(start: int) -> tuple[dict[str, np.ndarray], jax.Array, *tuple[Any, ...]]:

@@ -4,15 +4,13 @@
    linearisation repeats the filter about the smoothed moments.
 2. An observation family: expectation propagation replaces each likelihood term by a Gaussian site; the log density is
    the log evidence of the converged sites (`lfm_ppl.filtering.ep`).
-3. Constraints: `ConstrainedLikelihood`.
-4. A failure inside compiled code is a log density of -inf with zero gradients; outside of it a warning names the row.
+3. A failure inside compiled code is a log density of -inf with zero gradients; outside of it a warning names the row.
 
 Source: Hartikainen et al. (2012), section 4; Singer (2011), AStA 95.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,8 +25,7 @@ from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.intervals import EXPONENTIAL, METHODS, RUNGE_KUTTA
 from lfm_ppl.filtering.iterated import number_of_iterations
-from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
+from lfm_ppl.inference.series_likelihood import SeriesLikelihood, check_model, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -40,6 +37,10 @@ from lfm_ppl.utils.gradients import finite_or_minus_infinity
 
 SIMULATION_STEPS = 5
 """Steps of the simulator for one integration step of the filter: its paths are rougher than moments."""
+
+
+CONSTRAINTS = ("lower", "upper", "constraints", "grid", "draws")
+"""Arguments of `lfm_ppl.ConstrainedLikelihood` that this likelihood does not have."""
 
 
 class MarginalLikelihood(SeriesLikelihood):
@@ -63,7 +64,7 @@ class MarginalLikelihood(SeriesLikelihood):
         max_step: longest step, in units of time; longer intervals get more steps. None: twice the median step. A linear
             model without known inputs is exact, and needs no steps.
         iterations: of posterior linearisation; 0 for none. By default 3 for a model that is not linear, and 0 for a
-            linear model, an observation family, constraints, or with a ``tolerance``.
+            linear model, an observation family, or with a ``tolerance``.
         damping: largest share of each new iterate that is taken; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations. With it the length of the steps follows
             the moments, for every parameter anew, for posteriors over slow and fast models; up to five times ``steps``
@@ -76,21 +77,6 @@ class MarginalLikelihood(SeriesLikelihood):
             assumed density filtering, which is rougher, and -inf in a linear one.
         method: of integration, "runge-kutta" (explicit), or "exponential" for stiff dynamics: its steps of order three
             are stable however fast a state decays, and each costs some ten of the other. With a ``tolerance``, too.
-        lower: name of a state, force or output -> its lower bound. Under constraints the log density is
-            log Z(y, c) - log Z(c), that of the data given that the constraints are respected: by expectation
-            propagation, made right with ``draws`` trajectories that respect them. It is -inf where that does not
-            converge. Not with an observation family, ``iterations``, ``max_step``, ``tolerance`` or ``method``. The
-            object is then an `lfm_ppl.inference.constrained_likelihood.ConstrainedLikelihood`.
-        upper: the same for upper bounds.
-        constraints: functions c(x, u, t), feasible where >= 0; with ``draws``, linear in x and u.
-        grid: (K,) times at which the constraints hold, or how many at equal distances from the initial time to the last
-            observation. By default the initial time and the times of the observations, and between those that are
-            further apart than 1/20 of the record times at equal distances; 100 at equal distances where observations
-            have more times. The cost is that of some tens of smoother passes over it, and the error of the importance
-            sampling grows with the number of rows.
-        draws: number of trajectories, an even one; 0: by expectation propagation alone, which may be off by .1 on a
-            coarse grid, and by .5 on a dense one. They have the same random numbers for all parameters, so that the
-            log density has no noise, but an error that varies slowly with the parameters.
 
     Raises:
         ValueError, TypeError: as `lfm_ppl.filter`; also where it is used in a ``numpyro.plate``. In compiled code a
@@ -114,25 +100,14 @@ class MarginalLikelihood(SeriesLikelihood):
 
     pytree_aux_fields = ("max_step", "iterations", "damping", "tolerance", "method", "sites")
 
-    def __new__(cls, model: Any = None, times: Any = None, rule: Rule | None = None, steps: int = 10,
-                *filter_settings: Any, lower: Any = None, upper: Any = None, constraints: Any = (), grid: Any = None,
-                draws: int = 256, **filter_options: Any) -> Any:
-        """Return a `ConstrainedLikelihood` where there are constraints, whose `__init__` Python does not call again."""
-        if not (lower or upper or constraints):
-            return super().__new__(cls)
-        _check_model(model)
-        _refuse_filter_settings(*filter_settings, **filter_options)
-        return ConstrainedLikelihood(model, times, rule, steps, lower=lower, upper=upper, constraints=constraints,
-                                     grid=grid, draws=draws)
-
     def __init__(self, model: LatentForceModel, times: ArrayLike, rule: Rule | None = None, steps: int = 10,
                  max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
                  tolerance: float | None = None, sites: SiteSettings | str | None = None, *,
-                 method: str = RUNGE_KUTTA,
-                 lower: Mapping[str, ArrayLike] | None = None, upper: Mapping[str, ArrayLike] | None = None,
-                 constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (),
-                 grid: ArrayLike | int | None = None, draws: int = 256, validate_args: bool | None = None):
-        _check_model(model)
+                 method: str = RUNGE_KUTTA, validate_args: bool | None = None, **unknown: Any):
+        for name in unknown:
+            remedy = "; constraints are arguments of lfm.ConstrainedLikelihood" if name in CONSTRAINTS else ""
+            raise TypeError(f"MarginalLikelihood has no argument {name!r}{remedy}.")
+        check_model(model)
         check_iterations(iterations, damping, tolerance)
         if tolerance is not None:
             checks.positive("tolerance", tolerance, "It is in standard deviations, 0.001 for example.")
@@ -246,23 +221,3 @@ class MarginalLikelihood(SeriesLikelihood):
             return simulation.state, simulation.y
 
         return repeat_draw(draw, key, sample_shape)
-
-
-def _check_model(model: Any) -> None:
-    if not isinstance(model, LatentForceModel):
-        raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
-
-
-def _refuse_filter_settings(max_step: Any = None, iterations: Any = None, damping: float = 0.7, tolerance: Any = None,
-                            sites: Any = None, method: str = RUNGE_KUTTA, validate_args: Any = None) -> None:
-    """Raise ValueError for a setting of the filter that a likelihood under constraints does not have."""
-    for name, value in (("max_step", max_step), ("tolerance", tolerance)):
-        if value is not None:
-            raise ValueError(f"{name} is not supported under constraints, which add rows to the grid; raise steps.")
-    if method != RUNGE_KUTTA:
-        raise ValueError(f"method={method!r} is not supported under constraints; leave method out.")
-    if iterations:
-        raise ValueError("under constraints a non-linear model is always linearised about smoothed moments. Leave "
-                         "iterations out.")
-    if sites is not None:
-        raise ValueError("sites are for an observation family without constraints. Leave out sites.")

@@ -15,8 +15,8 @@ from numpyro.infer.util import potential_energy
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.inference.likelihood import Likelihood
+from lfm_ppl.inference.problem import Problem
 from lfm_ppl.inference.switching import Switching
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -40,7 +40,7 @@ def model_digest(bound: BoundModel) -> str:
     evaluate, recorder = bound.program("digest", lambda: _digest_program(bound))
     digest = hashlib.sha256(repr((bound.names, bound.size)).encode())
     for z in (medians, medians + _SHIFT):
-        for leaf in jax.tree.leaves(evaluate(z, jnp.asarray(times[selection]), bound.arguments)):
+        for leaf in jax.tree.leaves(evaluate(z, jnp.asarray(times[selection]), bound.problem)):
             is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
             array = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
             digest.update(f"{array.shape}{array.dtype}".encode() + _rounded(array))
@@ -49,12 +49,12 @@ def model_digest(bound: BoundModel) -> str:
 
 
 def _digest_program(bound: BoundModel) -> tuple[Any, _record_values]:
-    """Return the compiled function from z, times and the model's arguments to the values, and its recorder."""
+    """Return the compiled function from z, times and the problem to the values, and its recorder."""
     recorder = _record_values(bound.model)
 
-    def evaluate(z: jax.Array, times: jax.Array, arguments: Any) -> tuple[jax.Array, list[Any]]:
+    def evaluate(z: jax.Array, times: jax.Array, problem: Problem) -> tuple[jax.Array, list[Any]]:
         recorder.times = times
-        prior = potential_energy(recorder, *bound.traced.call(arguments), bound.unravel(z))
+        prior = potential_energy(recorder, *problem.call(), bound.unravel(z))
         return prior, recorder.values
 
     return Program(evaluate), recorder
@@ -94,9 +94,9 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         super().begin()
         self.values, self.settings = [], ""
 
-    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> Any:
         """Evaluate the models of the likelihood, of its first series for a panel."""
-        distribution = likelihood.first if isinstance(likelihood, Panel) else likelihood
+        distribution = likelihood.first
         ssm, model = distribution.ssm, distribution.model
         # Not the leaves of the distribution itself: NumPyro orders its fields by their hashes.
         names = sorted(set(type(likelihood).gather_pytree_data_fields()) - {"model", "models"})

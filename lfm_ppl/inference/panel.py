@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
 from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
@@ -22,7 +21,8 @@ from lfm_ppl.filtering.arguments import as_rule
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA
 from lfm_ppl.filtering.stiffness import long_step_message, warn_of_message
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.inference.constrained_likelihood import likelihood_with
+from lfm_ppl.inference.likelihood import Likelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, refuse_times_by_site, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.events import check_start, event_table
@@ -35,7 +35,7 @@ from lfm_ppl.utils.batching import mapped
 from lfm_ppl.utils.programs import Program
 
 
-class Panel(dist.Distribution):
+class Panel(Likelihood):
     """Many independent series as one distribution with a batch shape; made by `panel`."""
 
     support = constraints.real_matrix
@@ -88,7 +88,7 @@ class Panel(dist.Distribution):
         return np.ndim(self.times) == 2
 
     def _likelihood(self, parameters: Any, times: Any) -> SeriesLikelihood:
-        return MarginalLikelihood(self.build(parameters), times, **self.settings)
+        return likelihood_with(self.build(parameters), times, self.settings)
 
     def _check_events(self, count: int) -> None:
         """Raise ValueError if an event of a series lies before its initial time."""
@@ -113,6 +113,15 @@ class Panel(dist.Distribution):
     def first(self) -> SeriesLikelihood:
         """The distribution of the first series."""
         return self.series(0)
+
+    @property
+    def members(self) -> list[SeriesLikelihood]:
+        """The distributions of all series."""
+        return [self.series(index) for index in range(self.batch_shape[0])]
+
+    def split_key(self, key: jax.Array) -> jax.Array:
+        """Return a random key for each series (B,)."""
+        return jax.random.split(key, self.batch_shape[0])
 
     def series(self, index: int) -> SeriesLikelihood:
         """Return the distribution of one series."""
@@ -160,8 +169,7 @@ class Panel(dist.Distribution):
         """Simulate every series: (*sample_shape, B, T, D)."""
 
         def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-            keys = jax.random.split(key, self.batch_shape[0])
-            return self.mapped(lambda series, key: series.simulate(key), keys)
+            return self.mapped(lambda series, key: series.simulate(key), self.split_key(key))
 
         state, y = repeat_draw(draw, key, sample_shape)
         warn_of_infinite_states(state, self.times, self.first.model.state_names)

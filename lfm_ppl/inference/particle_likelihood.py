@@ -22,7 +22,7 @@ from numpyro.distributions import constraints
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.likelihood import Likelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.particles.particle_filter import ParticleSettings, check_settings, log_likelihood
@@ -50,7 +50,7 @@ class ParticleLikelihood(dist.Distribution):
     pytree_data_fields = ("base", "key")
     pytree_aux_fields = ("settings", "steps")
 
-    def __init__(self, base: SeriesLikelihood | Panel, key: jax.Array, settings: ParticleSettings,
+    def __init__(self, base: Likelihood, key: jax.Array, settings: ParticleSettings,
                  steps: int | None = None) -> None:
         self.base, self.key, self.settings, self.steps = base, key, settings, steps
         super().__init__(base.batch_shape, base.event_shape, validate_args=False)
@@ -58,10 +58,7 @@ class ParticleLikelihood(dist.Distribution):
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log of the estimate; for a panel one for each series."""
         value = jnp.asarray(checks.unmask(value), float)
-        if isinstance(self.base, Panel):
-            keys = jax.random.split(self.key, self.base.batch_shape[0])
-            return self.base.mapped(self._series_log_prob, value, keys)
-        return self._series_log_prob(self.base, value, self.key)
+        return self.base.mapped(self._series_log_prob, value, self.base.split_key(self.key))
 
     def _series_log_prob(self, base: SeriesLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
         grid = build_time_grid(base.ssm, base.times, self.steps or base.steps, base.max_step)
@@ -107,7 +104,7 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
                 "numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without constraints, mask, expand or plate "
                 "(or an lfm.panel in its plate).")
 
-    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> Any:
         """Return the estimate."""
         return ParticleLikelihood(likelihood, self.key, self.settings, self.steps)
 
@@ -189,9 +186,9 @@ class ParticlePotential:
         Estimates of zero count as the worst of the others; infinite where they are the majority.
         """
         name = ("spread of estimates", self.settings._replace(particles=particles), self._steps)
-        run = self._bound.compiled(name, lambda: Program(
-            lambda z, keys, y: jax.lax.map(lambda k: self(z, k, particles, y), keys)))
-        energies = np.asarray(run(z, jax.random.split(key, _REPLICATES), self._bound.argument))
+        run = self._bound.program(name, lambda: Program(
+            lambda z, keys, y: jax.lax.map(lambda k: self(z, k, particles, y), keys)), self._bound.constants)
+        energies = np.asarray(run(z, jax.random.split(key, _REPLICATES), self._bound.constants))
         finite = np.isfinite(energies)
         if finite.mean() < 0.5:
             return float("inf")

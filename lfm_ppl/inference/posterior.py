@@ -21,10 +21,9 @@ from lfm_ppl.filtering.intervals import EXPONENTIAL
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.map_draws import BatchStore, SharedFunction, map_draws, map_series
-from lfm_ppl.inference.model_arguments import signature
-from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.map_draws import BatchStore, map_draws
 from lfm_ppl.inference.path_plan import PathPlan, first_simulated_times, has_forecast, plan_paths
+from lfm_ppl.inference.problem import Partition, Problem, signature
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -70,10 +69,10 @@ def scores(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], *,
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         log_priors = {LOG_PRIOR + name: value for name, value in bound.site_log_priors(values, y).items()}
         distribution, y = bound.likelihood(values, y), bound.data(y)
-        keys = jax.random.split(key, y.shape[0]) if isinstance(distribution, Panel) else key
-        return map_series(distribution, lambda series, y, key: series.scores(key, y), y, keys) | log_priors
+        keys = distribution.split_key(key)
+        return distribution.mapped(lambda series, y, key: series.scores(key, y), y, keys) | log_priors
 
-    return map_draws(bound, "scores", SharedFunction(per_draw), draws, key, rows=bound.times.size,
+    return map_draws(bound, "scores", per_draw, draws, key, rows=bound.times.size,
                      report=report, store=store)
 
 
@@ -144,7 +143,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
     is_forecast = None
     if particles is None and example.has_gaussian_state and example.ssm.drift_structure.nonlinear:
         is_forecast = has_forecast(bound, requested_times)
-    is_shared = particles is None and bound.traced.inputs is not None
+    is_shared = particles is None and bound.problem.has_traced_inputs
     count = None if requested_times is None else requested_times.shape[-1]
     if requested_times is not None and is_shared and not is_forecast:
         # Repetitions of the last time, so that similar times share a program; their results are removed below.
@@ -216,29 +215,30 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
         noise = jnp.diagonal(covariance, axis1=1, axis2=2)
         return results | {"prediction": prediction, "predictive_sd": jnp.sqrt(variance + noise)}
 
-    def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
-        distribution = bound.likelihood(values, y)
-        y = bound.data(y)
-        keys = jax.random.split(key, y.shape[0]) if isinstance(distribution, Panel) else key
-        return map_series(distribution, draw_series, y, keys, *([plan.times] if plan.is_of_series else []))
+    def per_draw(values: Any, key: jax.Array, problem: Problem) -> dict[str, jax.Array]:
+        distribution = bound.likelihood(values, problem)
+        y = bound.data(problem)
+        keys = distribution.split_key(key)
+        return distribution.mapped(draw_series, y, keys, *([plan.times] if plan.is_of_series else []))
 
-    def shared_per_draw(values: Any, key: jax.Array, y: Any, times: Any, inputs: Any) -> dict[str, jax.Array]:
-        distribution = bound.likelihood(values, y)
+    def shared_per_draw(values: Any, key: jax.Array, problem: Problem, times: Any,
+                        reached: Partition) -> dict[str, jax.Array]:
+        distribution = bound.likelihood(values, problem)
         assert isinstance(distribution, SeriesLikelihood)
-        return draw_series(distribution, bound.data(y), key, times, None if inputs is None else inputs.value[1])
+        return draw_series(distribution, bound.data(problem), key, times, reached.value)
 
     name: tuple = ("trajectories", particles, particle_steps, is_forecast, is_stiff)
     if is_shared:
         # Where the path is simulated the smoother stays at the last row of the data, at no cost.
         reached = plan.times if plan.times is None or not is_forecast else np.minimum(plan.times, bound.times.max())
-        inputs = None if reached is None else bound.traced.lay_out(bound.site.name, reached)
         name = (*name, len(plan.requested), plan.rows, requested_times is None, plan.steps if is_forecast else None)
-        paths = map_draws(bound, name, SharedFunction(shared_per_draw, (plan.times, inputs)), draws, key,
-                          rows=plan.rows, **options)
+        paths = map_draws(bound, name, shared_per_draw, draws, key, rows=plan.rows,
+                          arguments=(bound.problem, plan.times, bound.requested(reached)), **options)
         return {name: value if name in ("y", "log_likelihood", _PRODUCT) else value[..., :count, :]
                 for name, value in paths.items()}
     rows = plan.rows * (1 if particles is None else particles.particles)
-    return map_draws(bound, (*name, signature(requested_times)), per_draw, draws, key, rows=rows, **options)
+    return map_draws(bound, (*name, signature(requested_times), signature(plan)), per_draw, draws, key, rows=rows,
+                     arguments=(bound.constants,), **options)
 
 
 def _of_family(ssm: StateSpaceModel, keys: Mapping[str, jax.Array], w: jax.Array, when: jax.Array,

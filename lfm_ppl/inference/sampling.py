@@ -200,7 +200,7 @@ def _initial_state(key: jax.Array, sampler: BoundSampler, starts: np.ndarray, sa
     densities = [sampler.evaluate(start) for start in starts]
     energy, slope = (-np.stack([np.asarray(value) for value in values]) for values in zip(*densities, strict=True))
     keys = split_keys(key, len(starts))(slice(None))
-    state = _init_program(sampler)(keys, np.asarray(starts), energy, slope, sampler.argument, sampler.tuning)
+    state = _init_program(sampler)(keys, np.asarray(starts), energy, slope, sampler.problem, sampler.tuning)
     row = jax.eval_shape(jax.vmap(sampler.algorithm.summary), state)
     rows = {name: np.zeros((leaf.shape[0], samples, *leaf.shape[1:]), leaf.dtype) for name, leaf in row.items()}
     return Saved(0, _to_host(state), rows)
@@ -213,7 +213,7 @@ def _init_program(sampler: BoundSampler) -> Any:
     def init(key: jax.Array, z: jax.Array, energy: jax.Array, slope: jax.Array, y: Any, tuning: Any) -> Any:
         return algorithm.init(key, ParamInfo(bound.unravel(z), energy, bound.unravel(slope)), y, tuning)
 
-    return sampler.compiled("start", lambda: Program(jax.vmap(init, in_axes=(0, 0, 0, 0, None, None))))
+    return sampler.program("start", lambda: Program(jax.vmap(init, in_axes=(0, 0, 0, 0, None, None))))
 
 
 def _to_host(state: Any) -> list[np.ndarray]:
@@ -255,12 +255,12 @@ class _BlockProgram:
             mesh = Mesh(np.array(jax.local_devices()[:chains]), tuple(_CHAIN_AXIS))
         self._sampler, self._schedule, self._chains = sampler, schedule, chains
         self._is_sequential = method == "sequential"
-        self._advance = sampler.compiled(("block", method, mesh), lambda: _advance(sampler, method, mesh))
+        self._advance = sampler.program(("block", method, mesh), lambda: _advance(sampler, method, mesh))
         # The layout of the program's results; another one would compile the second block again.
         self._layout = None if mesh is None else NamedSharding(mesh, _CHAIN_AXIS)
         # Data on one device cannot be read by chains on several devices.
-        self._argument = (sampler.argument if mesh is None
-                          else jax.device_put(sampler.argument, NamedSharding(mesh, PartitionSpec())))
+        self._problem = (sampler.problem if mesh is None
+                          else jax.device_put(sampler.problem, NamedSharding(mesh, PartitionSpec())))
 
     def to_device(self, saved: Saved) -> tuple[Any, dict[str, jax.Array]]:
         """Return the state of all chains and their draws on the devices; the inverse of `_to_host`."""
@@ -268,7 +268,7 @@ class _BlockProgram:
         points, energy = (jax.ShapeDtypeStruct((self._chains, *shape), float) for shape in ((bound.size,), ()))
         keys = jax.random.split(jax.random.key(0), self._chains)
         shapes, structure = jax.tree_util.tree_flatten(jax.eval_shape(
-            _init_program(sampler), keys, points, energy, points, sampler.argument, sampler.tuning))
+            _init_program(sampler), keys, points, energy, points, sampler.problem, sampler.tuning))
         state = jax.tree_util.tree_unflatten(structure, [
             self._leaf_to_device(leaf, shape) for leaf, shape in zip(saved.leaves, shapes, strict=True)])
         return state, {name: jax.device_put(rows, self._layout) for name, rows in saved.rows.items()}
@@ -282,9 +282,9 @@ class _BlockProgram:
         """Return the state and the draws after the steps from ``first`` to ``end``."""
         steps = first, end, self._schedule.warmup, self._schedule.thin
         if not self._is_sequential:
-            return self._advance(state, rows, *steps, self._argument)
+            return self._advance(state, rows, *steps, self._problem)
         chains = (jax.tree.map(lambda leaf, chain=chain: leaf[chain], (state, rows)) for chain in range(self._chains))
-        results = [self._advance(*chain, *steps, self._argument) for chain in chains]
+        results = [self._advance(*chain, *steps, self._problem) for chain in chains]
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
 
 

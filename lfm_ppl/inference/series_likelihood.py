@@ -34,6 +34,7 @@ from lfm_ppl.filtering.smoother import SmootherResult, filtered_mean, smooth_on
 from lfm_ppl.filtering.stiffness import ExplicitSteps, explicit_steps, has_explicit_steps, warn_of_long_steps
 from lfm_ppl.filtering.time_grid import build_time_grid, lay_out_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
+from lfm_ppl.inference.likelihood import Likelihood
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.events import EventTable, event_table
@@ -45,7 +46,7 @@ from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
 
 
-class SeriesLikelihood(dist.Distribution):
+class SeriesLikelihood(Likelihood):
     """Distribution of the observations of one series, with state and forces integrated out.
 
     Args:
@@ -79,6 +80,24 @@ class SeriesLikelihood(dist.Distribution):
             model.check_span(float(concrete_times[0]), float(concrete_times[-1]))
         warn_single_precision()
         super().__init__((), (np.shape(times)[0], self.ssm.output_dim), validate_args=False)
+
+    @property
+    def first(self) -> SeriesLikelihood:
+        """The distribution itself."""
+        return self
+
+    @property
+    def members(self) -> list[SeriesLikelihood]:
+        """The distribution itself, as the only member."""
+        return [self]
+
+    def mapped(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return ``function(distribution, *arguments)``."""
+        return function(self, *arguments)
+
+    def split_key(self, key: jax.Array) -> jax.Array:
+        """Return the key."""
+        return key
 
     # Both are functions of the fields above, and are computed again in a copy that JAX builds from other leaves.
     @functools.cached_property
@@ -330,6 +349,12 @@ class SeriesLikelihood(dist.Distribution):
         values = finite_or_minus_infinity(values_and_changes, y)
         warn_of_iterations(*values[-2:])
         return values[:-2]
+
+
+def check_model(model: Any) -> None:
+    """Raise TypeError unless ``model`` is a latent force model."""
+    if not isinstance(model, LatentForceModel):
+        raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
 
 
 def refuse_times_by_site(times: Any) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
-from lfm_ppl.inference.map_draws import SharedFunction, map_draws, map_series
+from lfm_ppl.inference.map_draws import map_draws
 
 POINTS = 100
 """Points at which the likelihood is evaluated."""
@@ -80,13 +80,13 @@ def failures_at(bound: BoundModel, values: Mapping[str, Any]) -> SiteFailures | 
         return None
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> tuple[jax.Array, jax.Array]:
-        return map_series(bound.likelihood(values, y), lambda series, y: series.convergence(y), bound.data(y))
+        return bound.likelihood(values, y).mapped(lambda series, y: series.convergence(y), bound.data(y))
 
     def in_all_series(flags: Any) -> np.ndarray:
         return np.all(np.asarray(flags).reshape(len(flags), -1), axis=1)
 
     converged, possible = map(in_all_series, map_draws(
-        bound, "convergence of the sites", SharedFunction(per_draw), _evenly_spaced(values, POINTS), jax.random.key(0),
+        bound, "convergence of the sites", per_draw, _evenly_spaced(values, POINTS), jax.random.key(0),
         rows=bound.times.size))
     return SiteFailures(len(converged), int((~converged).sum()), int((~possible).sum()))
 

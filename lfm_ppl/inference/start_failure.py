@@ -13,7 +13,6 @@ from numpyro.infer import init_to_median
 from lfm_ppl.filtering.breakdown import breakdown, family_breakdown
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
-from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.inference.switching import Switching
 
@@ -54,16 +53,15 @@ def _likelihood_failure(bound: BoundModel, z: Any) -> str | None:
     """Return a sentence on the site, the series and the row at which the likelihood fails."""
     for name, site_model in bound.site_models.items():
         distribution, y = site_model.likelihood(z), site_model.y
-        is_panel = isinstance(distribution, Panel)
-        for index in range(distribution.batch_shape[0] if is_panel else 1):
-            member = distribution.series(index) if is_panel else distribution
-            rows = (y[index] if is_panel else y).reshape(member.event_shape)
+        members = distribution.members
+        for index, member in enumerate(members):
+            rows = y.reshape(len(members), *member.event_shape)[index]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # the same reasons, as warnings
                 if np.isfinite(member.log_prob(rows)):
                     continue
-            return ((f"site {name!r}: " if bound.is_by_site else "") + (f"series {index}: " if is_panel else "")
-                    + _series_failure(member, rows))
+            series = f"series {index}: " if distribution.batch_shape else ""
+            return (f"site {name!r}: " if bound.is_by_site else "") + series + _series_failure(member, rows)
     return None
 
 

@@ -25,7 +25,6 @@ from lfm_ppl.filtering.iterated import DEFAULT_ITERATIONS
 from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
-from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.posterior import evenly_spaced
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.resolution import resolution_messages
@@ -116,10 +115,9 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
 def resolution_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray]) -> list[str]:
     """Return messages on steps and forces that are too coarse at the posterior medians of the parameters."""
     likelihood = bound.likelihood({name: np.median(values, axis=0) for name, values in draws.items()})
-    y = np.asarray(bound.y)
-    if isinstance(likelihood, Panel):
-        likelihood, y = likelihood.first, y[0]
-    return [*_long_steps(likelihood), *resolution_messages(likelihood.model, likelihood.times, y)]
+    first, y = likelihood.first, np.asarray(bound.y)
+    rows = y[0] if likelihood.batch_shape else y
+    return [*_long_steps(first), *resolution_messages(first.model, first.times, rows)]
 
 
 def finite_sd(values: np.ndarray) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.map_draws import map_draws, map_series
+from lfm_ppl.inference.map_draws import map_draws
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -59,7 +59,7 @@ def log_densities(bound: BoundModel, draws: Mapping[str, Any], predicted: xr.Dat
         distribution = bound.likelihood(values, data)
         if isinstance(distribution, Panel):
             times = jnp.broadcast_to(times, (y.shape[0], times.shape[-1]))
-        return map_series(distribution, series_log_prob, w, y, times)
+        return distribution.mapped(series_log_prob, w, y, times)
 
     log_densities = map_draws(bound, ("log densities", y.shape), per_draw,
                       {**draws, _PATH: w, _VALUES: np.broadcast_to(y, (count, *y.shape)),

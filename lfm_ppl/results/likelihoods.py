@@ -24,8 +24,7 @@ from lfm_ppl.filtering.problem import filter_problem, is_linear, is_observation_
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.map_draws import BatchStore, SharedFunction, map_draws, map_series
-from lfm_ppl.inference.panel import Panel
+from lfm_ppl.inference.map_draws import BatchStore, map_draws
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -89,7 +88,7 @@ class LikelihoodProblem:
     @property
     def series(self) -> int:
         """Number of series."""
-        return self.y.shape[0] if isinstance(self.bound.site.distribution, Panel) else 1
+        return len(self.bound.site.members)
 
     def select(self, rows: Any) -> LikelihoodProblem:
         """Return the same problem with some of the draws."""
@@ -156,7 +155,7 @@ def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods", **settin
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
         return {"total": bound.likelihood(values, y).log_prob(bound.data(y)).sum()}
 
-    return map_draws(bound, "log likelihoods", SharedFunction(per_draw), problem.draws, jax.random.key(0),
+    return map_draws(bound, "log likelihoods", per_draw, problem.draws, jax.random.key(0),
                      rows=bound.times.size, store=problem.batch_store(name))["total"]
 
 
@@ -172,7 +171,7 @@ def recorded(problem: LikelihoodProblem, log_likelihoods: np.ndarray) -> np.ndar
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
         return bound.likelihood(values, y).log_prob_per_observation(bound.data(y)).sum()
 
-    return map_draws(bound, "one step ahead", SharedFunction(per_draw), problem.draws, jax.random.key(0),
+    return map_draws(bound, "one step ahead", per_draw, problem.draws, jax.random.key(0),
                      rows=bound.times.size, store=problem.batch_store("one-step-ahead terms"))
 
 
@@ -206,7 +205,7 @@ def on_grid(problem: LikelihoodProblem, settings: ReferenceSettings) -> Referenc
         return fokker_planck.log_likelihood(distribution.ssm, time_grid, y, layout)
 
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
-        return map_series(bound.likelihood(values, y), series_log_likelihood, bound.data(y)).sum()
+        return bound.likelihood(values, y).mapped(series_log_likelihood, bound.data(y)).sum()
 
     log_likelihoods = _map_sequentially(problem, jax.random.key(0), ("Fokker-Planck grid", layout, steps), per_draw,
                                         settings.show_progress)
@@ -303,8 +302,8 @@ def _particle_estimates(problem: LikelihoodProblem, particles: int, settings: Re
         y = bound.data(y)
 
         def replicate(key: jax.Array) -> jax.Array:
-            keys = jax.random.split(key, series) if isinstance(distribution, Panel) else key
-            return jnp.reshape(map_series(distribution, series_log_likelihood, y, keys), (series,))
+            keys = distribution.split_key(key)
+            return jnp.reshape(distribution.mapped(series_log_likelihood, y, keys), (series,))
 
         # Replicates of each series are averaged apart: their product over the series is noisier than the product of
         # their averages.
@@ -317,8 +316,8 @@ def _particle_estimates(problem: LikelihoodProblem, particles: int, settings: Re
 def _map_sequentially(problem: LikelihoodProblem, key: jax.Array, name: tuple[str, *tuple[Hashable, ...]],
                       per_draw: Callable, show_progress: bool) -> np.ndarray:
     """Map over draws, one after another, with a display of the progress."""
-    return map_draws(problem.bound, name, per_draw, problem.draws, key, report=Console() if show_progress else None,
-                     store=problem.batch_store(name[0]))
+    return map_draws(problem.bound, name, per_draw, problem.draws, key, arguments=(problem.bound.constants,),
+                     report=Console() if show_progress else None, store=problem.batch_store(name[0]))
 
 
 def _scout_models(problem: LikelihoodProblem) -> list[Any]:

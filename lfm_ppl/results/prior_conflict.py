@@ -21,7 +21,7 @@ def prior_conflicts(bound: BoundModel, draws: Mapping[str, np.ndarray]) -> list[
         draws: site name -> (S, ...), posterior draws.
     """
     medians = {name: np.median(values, axis=0) for name, values in draws.items()}
-    trace = bound.traced.trace_at(medians, bound.model_data)
+    trace = bound.trace_at(medians)
     conflicts = []
     for name, median in medians.items():
         site = trace.get(name)

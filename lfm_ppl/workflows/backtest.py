@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.traced_model import SharedPrograms
+from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.io.data import as_data
 from lfm_ppl.io.data_set import model_keywords
 from lfm_ppl.results import arviz_data
@@ -175,14 +175,14 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
     angular = np.isin(np.arange(y.shape[1]), model.observation.angular)
     period = model.observation.period
     reference = "persistence" if season is None else "seasonal-naive"
-    forecasts, naive, messages, programs = [], [], [], SharedPrograms()
+    forecasts, naive, messages, shared_model = [], [], [], SharedModel(numpyro_model)
     for origin in origins:
         past = np.where(np.arange(len(times))[:, None] <= origin, y, np.nan)
         future = slice(origin + 1, origin + 1 + horizon)
-        with warnings.catch_warnings(record=True) as caught, programs.in_use():
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
-                result = fit(numpyro_model, times, past, sampler=sampler, seed=seed, at=times, trajectory_draws=draws,
+                result = fit(shared_model, times, past, sampler=sampler, seed=seed, at=times, trajectory_draws=draws,
                              progress=False, **options)
                 predicted = arviz_data.group(result, GROUP).isel(time=future)
             except Exception as error:

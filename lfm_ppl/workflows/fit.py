@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 
 from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.inference import sampling
-from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.bound_model import BoundModel, StartError
 from lfm_ppl.inference.degenerate_mode import degenerate_entries
 from lfm_ppl.inference.kernels.options import check_options
 from lfm_ppl.inference.long_steps import long_step_messages
@@ -352,9 +352,7 @@ def _explain_start_failure(bound: BoundModel) -> Iterator[None]:
     """Add the part of the density that fails at the prior median to the error of a failed search for a start."""
     try:
         yield
-    except ValueError as error:
-        if "finite density" not in str(error):
-            raise
+    except StartError as error:
         reason = best_effort("reason why there is nowhere to start", lambda: start_failure(bound), None)
         if reason is None:
             raise

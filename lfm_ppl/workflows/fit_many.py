@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.parallel.cluster import Workers, check_workers
 from lfm_ppl.parallel.run import outcomes
 from lfm_ppl.parallel.task import Task
@@ -237,15 +238,14 @@ def fit_many(
         checks.one_of("data set in each", name, names)
         _check_options(f"each[{name!r}]", each[name], [*shared, "truth", "name"])
     tasks: dict[str, Task] = {}
-    compute = FitDataSet(numpyro_model)
+    compute = FitDataSet(SharedModel(numpyro_model))
     digests: dict[Any, str] = {}
     for name, value in pairs:
         if not isinstance(name, str) or not name:
             raise TypeError(f"the names of data sets must be texts, got {name!r}.")
         if name in tasks:
             raise ValueError(f"two data sets are called {name!r}; give every one a name of its own.")
-        with compute.programs.in_use():
-            tasks[name] = fit_task(numpyro_model, name, value, {**options, **each.get(name, {})}, seed, digests)
+        tasks[name] = fit_task(compute.model, name, value, {**options, **each.get(name, {})}, seed, digests)
     return ManyFits(compute, tasks, None if out is None else Path(out), workers=workers, overwrite=overwrite,
                     report=(report or Console()) if progress else None)
 

@@ -15,7 +15,6 @@ import jax
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.priors import assumptions, prior_interval, without_parameters
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
@@ -140,8 +139,7 @@ def describe_assumptions(bound: BoundModel) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a draw of the prior may be extreme
         another = bound.likelihood({name: _draw(trace[name]["fn"], trace[name]["value"]) for name in bound.sites})
-    example = another.first if isinstance(another, Panel) else another
-    descriptions = assumptions(example.ssm.model)
+    descriptions = assumptions(another.first.ssm.model)
     return json.dumps({topic: without_parameters(description, descriptions[topic])
                        for topic, description in assumptions(bound.site.example.ssm.model).items()})
 

@@ -14,9 +14,9 @@ import jax
 import numpy as np
 
 from lfm_ppl.inference.bind import bind
-from lfm_ppl.inference.model_arguments import signature
 from lfm_ppl.inference.model_digest import model_digest
-from lfm_ppl.inference.traced_model import SharedPrograms
+from lfm_ppl.inference.problem import signature
+from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.io.data_set import Data, model_keywords
 from lfm_ppl.parallel.task import Task
 from lfm_ppl.results.packing import pack_result
@@ -76,7 +76,7 @@ def _model_digest(model: Callable, times: np.ndarray, y: np.ndarray, keywords: A
         value = model_digest(bound)
     except Exception:  # raised again by the fit of this data set
         return "none"
-    if bound.argument is not None:  # else the model depends on the values of its data
+    if bound.problem.data is not None:  # else the model depends on the values of its data
         digests[key] = value
     return value
 
@@ -110,15 +110,13 @@ def file_name(name: str) -> str:
 class FitDataSet:
     """Function from a task to the result of its fit as arrays; all tasks of a process have the same programs."""
 
-    model: Callable
-    programs: SharedPrograms = dataclasses.field(default_factory=SharedPrograms, compare=False)
+    model: SharedModel
 
     def __call__(self, task: Task) -> dict[str, Any]:
         """Return the result of `fit` with its warnings as attribute `WARNINGS`."""
         times, y, options = task.data
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
-            with self.programs.in_use():
-                result = fit(self.model, times, y, progress=False, **options)
+            result = fit(self.model, times, y, progress=False, **options)
         messages = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
         return pack_result(result, {WARNINGS: json.dumps(messages)})

@@ -30,7 +30,7 @@ def genes(decay, lengthscale):
 
 def bounded(decay, lengthscale):
     """The factor cannot be negative."""
-    return lfm.MarginalLikelihood(genes(decay, lengthscale), TIMES, lower={"factor": 0.0}, grid=TIMES, draws=32)
+    return lfm.ConstrainedLikelihood(genes(decay, lengthscale), TIMES, lower={"factor": 0.0}, grid=TIMES, draws=32)
 
 
 def transcription(times, y=None):

@@ -7,12 +7,14 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
 import pytest
 from references import LinearLFM, Regression, matern
 from scipy.stats import multivariate_normal
 from systems import Linear, whole_state
 
 import lfm_ppl as lfm
+from lfm_ppl.inference.handlers.settings import approximate
 
 NOISE = 0.08**2
 
@@ -64,7 +66,7 @@ def evidence(case, draws):
     times, y = data(count, span)
     bounds_by_side = [np.array([bounds.get(name, none) for name in ("x", "factor")])
                       for bounds, none in ((lower, -np.inf), (upper, np.inf))]
-    likelihood = lfm.MarginalLikelihood(model(), times, lower=lower, upper=upper, grid=times, draws=draws)
+    likelihood = lfm.ConstrainedLikelihood(model(), times, lower=lower, upper=upper, grid=times, draws=draws)
     return float(jax.jit(likelihood.log_prob)(y)), reference(times, y, *bounds_by_side)
 
 
@@ -84,8 +86,8 @@ def test_expectation_propagation_alone_serves_two_bounds_on_a_coarse_grid():
 @pytest.mark.slow
 def test_a_constraint_that_says_nothing_new_changes_nothing():
     times, y = data(4, 3.0)
-    values = [float(jax.jit(lfm.MarginalLikelihood(model(), times, lower={"factor": 0.0}, constraints=more, grid=times,
-                                                   draws=1024).log_prob)(y))
+    values = [float(jax.jit(lfm.ConstrainedLikelihood(model(), times, lower={"factor": 0.0}, constraints=more,
+                                                      grid=times, draws=1024).log_prob)(y))
               for more in ((), lambda x, u, t: u[0] + 0.5, lambda x, u, t: 2.0 * u[0])]
     np.testing.assert_allclose(values[1:], values[0], atol=0.03)
 
@@ -96,7 +98,7 @@ def small():
 
     @jax.jit
     def log_prob(y, lengthscale, low):
-        return lfm.MarginalLikelihood(model(lengthscale), times, lower={"factor": low}, upper={"factor": 1.0},
+        return lfm.ConstrainedLikelihood(model(lengthscale), times, lower={"factor": low}, upper={"factor": 1.0},
                                       grid=times, draws=64).log_prob(y)
 
     return log_prob, y
@@ -128,13 +130,26 @@ def test_what_cannot_be_is_minus_infinity_with_finite_derivatives():
 def test_settings_that_constraints_do_not_take():
     times = np.arange(3.0)
     for settings, name in (
-            ({"iterations": 2}, "iterations"), ({"max_step": 0.1}, "steps"), ({"tolerance": 0.1}, "steps"),
             ({"draws": 3}, "draws"), ({"draws": -2}, "draws"), ({"lower": {"fcator": 0.0}}, "'factor'"),
             ({"upper": {"factor": -1.0}}, "factor"), ({"constraints": lambda x, u, t: u[0] ** 2 - 1.0}, "linear"),
-            ({"grid": [0.0, -1.0]}, "grid")):
+            ({"grid": [0.0, -1.0]}, "grid"), ({"lower": None}, "lower")):
         with pytest.raises(ValueError, match=name):
-            lfm.MarginalLikelihood(model(), times, **{"lower": {"factor": 0.0}, **settings})
+            lfm.ConstrainedLikelihood(model(), times, **{"lower": {"factor": 0.0}, **settings})
+    for settings in ({"lower": {"factor": 0.0}}, {"grid": times, "draws": 2}):
+        with pytest.raises(TypeError, match="ConstrainedLikelihood"):
+            lfm.MarginalLikelihood(model(), times, **settings)
+    with pytest.raises(TypeError, match="factor"):
+        lfm.MarginalLikelihood(model(), times, factor=0.0)
+
+    def unconstrained(times, y=None):
+        numpyro.sample("y", lfm.MarginalLikelihood(model(), times), obs=y)
+
+    for settings, name in (({"iterations": 2}, "iterations"), ({"max_step": 0.1}, "steps"),
+                           ({"tolerance": 0.1}, "steps"), ({"method": "exponential"}, "method")):
+        constrained = approximate(unconstrained, lower={"factor": 0.0}, **settings)
+        with pytest.raises(ValueError, match=name):
+            numpyro.handlers.trace(numpyro.handlers.seed(constrained, jax.random.key(0))).get_trace(times)
     counts = lfm.LatentForceModel(Linear(jnp.array([[-0.6]]), jnp.array([[0.25]])), {"u": lfm.Matern(1.0, 1.0)},
                                   lfm.PoissonObservation(whole_state), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
     with pytest.raises(TypeError, match="GaussianObservation"):
-        lfm.MarginalLikelihood(counts, times, lower={"u": 0.0})
+        lfm.ConstrainedLikelihood(counts, times, lower={"u": 0.0})

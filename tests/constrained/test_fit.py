@@ -33,7 +33,7 @@ def system(lengthscale=1.0):
 
 def bounded(times, y=None, draws=32, grid=None):
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.0, 0.4))
-    numpyro.sample("y", lfm.MarginalLikelihood(system(lengthscale), times, lower={"factor": 0.0}, draws=draws,
+    numpyro.sample("y", lfm.ConstrainedLikelihood(system(lengthscale), times, lower={"factor": 0.0}, draws=draws,
                                                grid=grid), obs=y)
 
 
@@ -97,7 +97,7 @@ def test_unconverged_sites_and_light_weights_are_counted():
     worth = path_ess(bound, {"lengthscale": np.array([0.5, 1.0, 2.0])})
     assert worth.trajectories == 2 and 1.0 <= worth.least <= worth.median <= 2.0
     # Weights by hand, of the data and without them.
-    likelihood = lfm.MarginalLikelihood(system(), TIMES, lower={"factor": 0.0}, grid=TIMES, draws=64)
+    likelihood = lfm.ConstrainedLikelihood(system(), TIMES, lower={"factor": 0.0}, grid=TIMES, draws=64)
     problem = likelihood.truncated_posterior()
     by_hand = []
     for y in (jnp.asarray(Y), jnp.full_like(Y, jnp.nan)):

@@ -347,7 +347,7 @@ def test_a_digest_tells_models_that_need_the_values_of_their_data_apart():
         return model
 
     bound = [lfm.bind(branching(spread), TIMES, Y) for spread in (0.3, 0.3, 0.5)]
-    assert all(model.argument is None for model in bound)
+    assert all(model.problem.data is None for model in bound)
     digests = [model_digest(model) for model in bound]
     assert digests[0] == digests[1] != digests[2]
 

@@ -66,7 +66,7 @@ def test_the_weight_of_the_prior_and_the_data_are_arguments_of_one_program(bound
             np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-8)
             runs.append(value)
     assert len(set(runs)) == 4
-    run = bound.compiled(("energy", ("decay", "amount"), True), lambda: None)
+    run = bound.program(("energy", ("decay", "amount"), True), lambda: None)
     assert len(run._own) == 1
 
 

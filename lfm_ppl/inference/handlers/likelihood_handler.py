@@ -8,8 +8,7 @@ from typing import Any
 import numpyro.distributions as dist
 from numpyro.primitives import Messenger
 
-from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.inference.likelihood import Likelihood
 
 
 class Handler(Messenger):
@@ -52,7 +51,7 @@ class LikelihoodHandler(Handler):
         self.has_site = False
         super().__init__(fn)
 
-    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> Any:
         """Return the distribution that takes the place of the likelihood of a site; by default a likelihood of one."""
         shape = likelihood.batch_shape + likelihood.event_shape
         return dist.ImproperUniform(dist.constraints.real, (), shape).mask(False)
@@ -73,9 +72,8 @@ class LikelihoodHandler(Handler):
         """Replace the distribution of the site."""
         fn = msg.get("fn")
         is_selected = self.only_site is None or self.only_site == msg.get("name")
-        if msg["type"] == "sample" and is_selected and isinstance(fn, (SeriesLikelihood, Panel)):
-            series = fn.first if isinstance(fn, Panel) else fn
-            if not (series.has_gaussian_state or self.supports_all_likelihoods):
+        if msg["type"] == "sample" and is_selected and isinstance(fn, Likelihood):
+            if not (fn.first.has_gaussian_state or self.supports_all_likelihoods):
                 return
             self.has_site = True
             msg["fn"] = self.replacement(fn, msg)

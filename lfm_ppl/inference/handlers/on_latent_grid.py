@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
+from lfm_ppl.inference.likelihood import Likelihood
 from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
+from lfm_ppl.inference.series_likelihood import repeat_draw
 from lfm_ppl.latent_grid.latent_grid import RULES, LatentGrid
 from lfm_ppl.utils import checks
 
@@ -89,7 +90,7 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         return ("the model has no site numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y) without constraints, "
                 "mask, expand or plate, whose forces could be put on a grid.")
 
-    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> GridLikelihood:
+    def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> GridLikelihood:
         """Sample the forces, and return the distribution of the observations given them."""
         if isinstance(likelihood, Panel):
             raise ValueError(f"the site {site['name']!r} is a panel; put one series at a time on a grid.")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from lfm_ppl.inference.constrained_likelihood import likelihood_with
 from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.inference.likelihood import Likelihood
 from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
 from lfm_ppl.inference.switching import Switching
 
 NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "method", "sites", "lower", "upper",
@@ -61,7 +61,7 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
             "panel."
         )
 
-    def replacement(self, likelihood: SeriesLikelihood | Panel, site: dict[str, Any]) -> Any:
+    def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> Any:
         """Return the likelihood with the new settings."""
         if isinstance(likelihood, Switching):
             return likelihood.with_settings(**self.settings)
@@ -71,4 +71,4 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         settings |= ({"iterations": 0} if is_single_pass else {}) | self.settings
         if isinstance(likelihood, Panel):
             return Panel(likelihood.build, likelihood.parameters, likelihood.times, settings)
-        return MarginalLikelihood(likelihood.model, likelihood.times, **settings)
+        return likelihood_with(likelihood.model, likelihood.times, settings)
