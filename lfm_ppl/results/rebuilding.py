@@ -162,10 +162,10 @@ def _check_doses(name: str, stored: InputTable, table: InputTable, first: float,
 
     earlier, later = events(stored), events(table)
     for time, state in sorted({*earlier, *later}):
-        amounts = [amounts.get((time, state)) for amounts in (later, earlier)]
-        if None not in amounts and np.isclose(*amounts, rtol=_TOLERANCE, atol=0.0):
+        amounts = [entries.get((time, state), np.nan) for entries in (later, earlier)]
+        if np.isclose(amounts[0], amounts[1], rtol=_TOLERANCE, atol=0.0):
             continue
-        given, fitted = ("none" if amount is None else state if state == "a reset" else f"{amount:g} to {state}"
+        given, fitted = ("none" if np.isnan(amount) else state if state == "a reset" else f"{amount:g} to {state}"
                          for amount in amounts)
         raise ValueError(f"the doses {name!r} of the forecast at time {time:g} are {given}, where those of the fit are "
                          f"{fitted}. Before the last observation, at time {last:g}, they must be the same: give later "

@@ -216,7 +216,7 @@ def _continued_rows(later: Mapping[str, Any], model_kwargs: Mapping[str, Any], r
     stored, rows = known_inputs.inputs_of(result), y.shape[:-1]
     arguments, has_rows = dict(later), False
     for name, value in later.items():
-        earlier = model_kwargs.get(name)
+        earlier: Any = model_kwargs.get(name)
         if name in stored or not all(isinstance(array, np.ndarray | jax.Array) for array in (value, earlier)):
             continue
         lead = len(rows) if earlier.shape[:len(rows)] == rows else 1

@@ -249,8 +249,8 @@ def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, series: 
             continue
         band = np.array(_band(part, kind, name))
         first, last = windows.get(name, (-np.inf, np.inf))
-        time, mean, low, high = curves = band[:, band[0] >= first]
-        _draw_band(axes, curves, *colours, "95%")
+        time, mean, low, high = band[:, band[0] >= first]
+        _draw_band(axes, (time, mean, low, high), *colours, "95%")
         if paths is not None:
             later = paths.sel({kind: name, "time": (paths["time"] > time[-1]) & (paths["time"] <= last)})
             forecasts.draw_paths(axes, later, (time[-1], mean[-1], low[-1], high[-1]), *colours)
