@@ -12,6 +12,9 @@ from lfm_ppl.io.data_set import Data, in_unit
 from lfm_ppl.io.loading import ModelFile
 from lfm_ppl.utils import calendar_time, checks
 
+_ROWS_OF_HEADER = 3
+"""Rows that show the names of columns, after a line ``sep=``, and a row below them."""
+
 
 def read_data(path: str, model: ModelFile, options: DataOptions) -> Data:
     """Return the observations in a file, under the model's names of its outputs and inputs."""
@@ -51,7 +54,7 @@ def unit_of_file(options: DataOptions) -> str | None:
 
 def column_unit(path: str, time_column: str | None, series: str | None = None) -> str | None:
     """Return the unit in the name of the time column of a file, h of ``time_h``; None where it has none."""
-    table = tables.read_file(path)
+    table = tables.read_file(path, _ROWS_OF_HEADER)
     if series is not None:
         table = tables.Table(table.label, table.frame.drop(columns=series))
     return time_columns.unit_of(time_columns.find_time_column(table, time_column))

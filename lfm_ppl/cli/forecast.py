@@ -20,15 +20,14 @@ import pandas as pd
 
 import lfm_ppl
 from lfm_ppl.cli import choices, page, results, session
-from lfm_ppl.cli.data_file import column_unit, output_columns
+from lfm_ppl.cli.data_file import output_columns
 from lfm_ppl.cli.fit_arguments import TIME_UNIT
 from lfm_ppl.cli.options import ForecastOptions, Times
 from lfm_ppl.cli.requested_times import requested_times
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
-from lfm_ppl.io.data_set import Data, at_origin, continued_inputs, in_unit
+from lfm_ppl.io.data_set import Data, continued_inputs, on_clock_of_fit
 from lfm_ppl.io.dosing import ROLES
-from lfm_ppl.model.inputs import Input
 from lfm_ppl.results import arviz_data, files, html_report, inputs, plots, tables
 from lfm_ppl.results.plots.trajectories import trajectory_names
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, MEAN, held_out_data, summary
@@ -75,12 +74,10 @@ def run(result: str, options: ForecastOptions, line: Sequence[str]) -> int:
 def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) -> tuple[Any, pd.DataFrame | None]:
     """Return the forecast with the held-out data, and their scores; None without any."""
     times = requested_times(task.observed, options.times)
-    known_inputs = {}
+    keywords: dict[str, Any] = {"inputs": {}, "model_kwargs": task.keywords}
     if held_out is not None:
         times = np.union1d(times, held_out.times)
-        known_inputs = {name: table if table.is_dose else Input(*table[:3])
-                        for name, table in continued_inputs(task.observed.inputs, held_out.inputs).items()}
-    keywords: dict[str, Any] = {"inputs": known_inputs, "model_kwargs": task.keywords}
+        keywords["inputs"] = held_out.inputs
     forecast = lfm_ppl.forecast(task.posterior, task.model, times, draws=options.draws, seed=options.seed,
                                 progress=not options.quiet, **keywords)
     if held_out is None or not np.isfinite(held_out.y).any():
@@ -96,7 +93,9 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
     """Return the data of a file, on the clock of the fitted data and under the names of the result."""
     observed = task.observed
     if observed.series:
-        raise ValueError("--held-out is for results of one series; score a panel in Python, lfm.score(forecast, y).")
+        raise ValueError("--held-out is for results of one series; forecast one of the panel, which "
+                         "lfm.save(lfm.select_series(result, LABEL), FOLDER) writes, or score the panel in Python, "
+                         "lfm.score(forecast, y).")
     # Only the model file states that blank cells are zero.
     interpolations = {name: "zero" if task.file.inputs.get(name) == "zero" else table.interpolation
                       for name, table in observed.inputs.items()}
@@ -110,21 +109,13 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
         if name not in interpolations and way not in ROLES:
             raise ValueError(checks.unknown("known input of the result", name, interpolations))
     unit = observed.units.get("time", "")
-    time_unit = options.time_unit
-    if time_unit is None and column_unit(path, options.columns.time_column) is None:
-        time_unit = arviz_data.attributes(task.posterior).get(TIME_UNIT)
+    unit_of_fitted_file = arviz_data.attributes(task.posterior).get(TIME_UNIT)
     read = data.read_csv(path, output_columns(options.columns, model), options.columns.time_column,
-                         dict(columns.values()), time_unit or (unit if observed.origin is not None else None),
-                         observed=not columns)
-    if (read.origin is None) != (observed.origin is None):
-        kinds = ("plain numbers", "dates") if read.origin is None else ("dates", "plain numbers")
-        raise ValueError(f"{path}: its times are {kinds[0]}, the times of the result {kinds[1]}; use the same form.")
-    read = dataclasses.replace(read, outputs=observed.outputs, inputs={
-        name: read.inputs[column] for name, (column, _) in columns.items() if column in read.inputs})
-    read = in_unit(read, unit) if observed.origin is None else at_origin(read, observed.origin, unit)
-    if observed.origin is None and read.units.get("time", unit) != unit:
-        raise ValueError(f"{path}: its times are in {read.units['time']}, which cannot be converted to the unit of the "
-                         f"result, {unit or 'none'}.")
+                         dict(columns.values()), options.time_unit, observed=not columns,
+                         default_unit=unit_of_fitted_file or (unit if observed.origin is not None else None))
+    read = on_clock_of_fit(dataclasses.replace(read, outputs=observed.outputs, inputs={
+        name: read.inputs[column] for name, (column, _) in columns.items() if column in read.inputs}),
+        observed.origin, unit, path)
     if repeated_rows := int(np.isin(read.times, observed.times).sum()):
         print(f"note     {repeated_rows} of {len(read.times)} rows of {path} are at times of the fitted data: if they "
               "are the same data, their scores are not scores of a forecast")

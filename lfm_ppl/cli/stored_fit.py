@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,10 @@ def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit
     from lfm_ppl.results import arviz_data, rebuilding
     from lfm_ppl.results.inputs import ORIGIN, inputs_of
     from lfm_ppl.results.scalars import unit_of
-    from lfm_ppl.results.series import TIMES, series_dimension, series_labels, times_of
+    from lfm_ppl.results.series import TIMES, is_selected_series, panel_of, series_dimension, series_labels, times_of
+    from lfm_ppl.results.sites import is_selected_site
 
+    arviz_data.refuse_several_sites(posterior)
     attrs = arviz_data.attributes(posterior)
     model_path = model_file or attrs.get("model_file")
     if not model_path:
@@ -74,7 +76,12 @@ def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit
         raise ValueError(f"{path}, attribute settings: {checks.unknown('rule', settings['rule'], choices.RULES)}")
     settings["rule"] = choices.rule(settings.get("rule"))
     numpyro_model = approximate(model.model, **settings)
-    return StoredFit(posterior, model.name, numpyro_model, model.keywords(observed, options), observed, model)
+    # The model of a panel gets the known inputs of all series.
+    tables = inputs_of(panel_of(posterior)[0]) if is_selected_series(posterior) else observed.inputs
+    keywords = model.keywords(replace(observed, inputs=tables), options)
+    if is_selected_site(posterior):  # the result has them by site
+        keywords = {name: value for name, value in keywords.items() if name not in ("inputs", "events")}
+    return StoredFit(posterior, model.name, numpyro_model, keywords, observed, model)
 
 
 def _json_attribute(attrs: dict[str, Any], name: str, path: Path) -> dict[str, Any]:

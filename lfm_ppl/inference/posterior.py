@@ -32,6 +32,7 @@ from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.model.stiff_simulation import warn_of_infinite_states
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
+from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import semidefinite_root
 from lfm_ppl.utils.progress import Reporter
 from lfm_ppl.utils.random_keys import split_by_name
@@ -140,6 +141,8 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
     """
     particles, particle_steps = settings
     example = bound.site.example
+    # In compiled code the noise may be traced, so that rows cannot be compared.
+    has_row_noise = has_noise_of_rows(bound)
     is_forecast = None
     if particles is None and example.has_gaussian_state and example.ssm.drift_structure.nonlinear:
         is_forecast = has_forecast(bound, requested_times)
@@ -176,7 +179,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
                 results[_PRODUCT] = product
             w = jax.vmap(ssm.inputs)(states, when)
             results |= _moments(ssm, smoothed, w, is_smoothed, plan)
-            gaussian = not (isinstance(ssm.model.observation, ObservationFamily) or noise_of_rows(distribution))
+            gaussian = not (isinstance(ssm.model.observation, ObservationFamily) or has_row_noise)
             results |= _points(ssm, smoothed, w, when, is_smoothed, plan, keys["points"], gaussian)
             results |= {"log_likelihood": smoothed.log_likelihood.sum()}
         else:
@@ -187,7 +190,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
         results["deterministic"] = jax.vmap(ssm.deterministics)(w[requested], when[requested])
         if isinstance(ssm.model.observation, ObservationFamily):
             results |= _of_family(ssm, keys, w, when, plan)
-            if requested_times is not None and noise_of_rows(distribution):
+            if requested_times is not None and has_row_noise:
                 del results["prediction"]
             return results
         output = jax.vmap(ssm.observe)(w, when)
@@ -206,7 +209,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
             mean = jnp.where(is_smoothed[requested], normal_mean, mean)
             variance = jnp.where(is_smoothed[requested], jnp.maximum(spread, 0.0), 0.0)
         results |= {"predictive_mean": mean, "output_sd": jnp.sqrt(variance)}
-        if requested_times is not None and noise_of_rows(distribution):
+        if requested_times is not None and has_row_noise:
             return results
         prediction = replicated
         if requested_times is not None:
@@ -227,7 +230,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
         assert isinstance(distribution, SeriesLikelihood)
         return draw_series(distribution, bound.data(problem), key, times, reached.value)
 
-    name: tuple = ("trajectories", particles, particle_steps, is_forecast, is_stiff)
+    name: tuple = ("trajectories", particles, particle_steps, is_forecast, is_stiff, has_row_noise)
     if is_shared:
         # Where the path is simulated the smoother stays at the last row of the data, at no cost.
         reached = plan.times if plan.times is None or not is_forecast else np.minimum(plan.times, bound.times.max())
@@ -329,11 +332,22 @@ def evenly_spaced(chains: int, samples: int, count: int) -> tuple[np.ndarray, np
 
 
 def noise_of_rows(distribution: SeriesLikelihood) -> bool:
-    """Return whether the noise is specified for each row of the data, so that other rows have none."""
+    """Return whether the noise differs between the rows of the data, so that other rows have none."""
     observation = distribution.ssm.model.observation
     if isinstance(observation, ObservationFamily):
         return observation.has_row_parameters()
-    return not observation.varies_with_state and np.ndim(observation.covariance) == 3
+    if observation.varies_with_state or np.ndim(observation.covariance) != 3:
+        return False
+    covariance = checks.concrete(observation.covariance)
+    return covariance is None or bool((covariance != covariance[:1]).any())
+
+
+def has_noise_of_rows(bound: BoundModel) -> bool:
+    """Return whether the noise differs between the rows of the data, of any series."""
+    example = bound.site.example
+    is_of_series = not example.ssm.model.observation.varies_with_state and np.ndim(
+        example.ssm.model.observation.covariance) == 3
+    return any(map(noise_of_rows, bound.site.members if is_of_series else [example]))
 
 
 def _normal_outputs(ssm: StateSpaceModel) -> bool:

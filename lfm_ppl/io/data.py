@@ -24,7 +24,7 @@ _ROW_NAMES = re.compile(r"|Unnamed: \d+(\.\d+)*|row\W?names|replicate", re.IGNOR
 
 def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column: str | None = None,
              inputs: Sequence[str] | Mapping[str, str] = (), time_unit: str | None = None, *,
-             usual_unit: str | None = None, observed: bool = True) -> Data:
+             usual_unit: str | None = None, default_unit: str | None = None, observed: bool = True) -> Data:
     r"""Read observations and known inputs from a comma-separated file.
 
     Args:
@@ -44,7 +44,8 @@ def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column
         time_unit: unit of the times (ms, s, min, h, d, weeks, years). Dates are counted in it, by default in that of
             the time between rows. Numbers are in it; whole numbers that are all dates YYYYMMDD, YYYYMMDDHH or
             YYYYMMDDHHMM are read as dates if it is given, or if the name of the column is that of a date.
-        usual_unit: the default of ``time_unit``, the unit of a model.
+        usual_unit: the unit of dates where ``time_unit`` and the name of the time column say none, that of a model.
+        default_unit: ``time_unit`` where the name of the time column says none, that of an earlier file.
         observed: whether a file without any value of the outputs is an error; known inputs of the future have none.
 
     Returns:
@@ -71,7 +72,10 @@ def read_csv(path: str | Path, outputs: Sequence[str] | None = None, time_column
         >>> data.times.tolist(), data.units, data.origin, float(data.known_inputs()["heater"](7.5))
         ([6.0, 7.0], {'time': 'h'}, '2026-01-05T00:00:00', 1.0)
     """
-    return _read(tables.read_file(path), outputs, time_column, inputs, time_unit, usual_unit, observed=observed)
+    table = tables.read_file(path)
+    if time_unit is None and time_columns.unit_of(time_columns.find_time_column(table, time_column)) is None:
+        time_unit = default_unit
+    return _read(table, outputs, time_column, inputs, time_unit, usual_unit, observed=observed)
 
 
 def read_table(frame: Any, outputs: Sequence[str] | None = None, time_column: str | None = None,

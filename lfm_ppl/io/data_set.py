@@ -139,10 +139,24 @@ def end_at_resets(times: np.ndarray, values: np.ndarray, durations: np.ndarray,
 
 
 def continued_inputs(tables: Mapping[str, InputTable], later: Mapping[str, InputTable]) -> dict[str, InputTable]:
-    """Return the tables that a later file continues; its resets, in any table, end the infusions in all of them."""
-    resets = np.sort(np.concatenate([np.zeros(0), *(table.resets for table in later.values()
-                                                    if table.resets is not None)]))
-    return {name: tables[name].continued(table, resets) for name, table in later.items()}
+    """Return the tables that later ones continue, by name, and the doses that later resets end.
+
+    The later resets of a series, in any table, end the infusions in all tables of this series.
+    """
+    resets: dict[str, np.ndarray] = {}
+    for name, table in later.items():
+        series = name.partition(OF_SERIES)[2]
+        resets[series] = np.union1d(resets.get(series, np.zeros(0)), np.zeros(0) if table.resets is None else
+                                    table.resets)
+    continued = {}
+    for name, table in tables.items():
+        later_resets = resets.get(name.partition(OF_SERIES)[2], np.zeros(0))
+        if name in later:
+            continued[name] = table.continued(later[name], later_resets)
+        elif table.is_dose and later_resets.size:
+            values, durations = end_at_resets(table.times, table.values, table.durations_of_all, later_resets)
+            continued[name] = table._replace(values=values, durations=durations if durations.any() else None)
+    return continued
 
 
 @dataclass(frozen=True)
@@ -201,7 +215,7 @@ class Data:
             times = calendar_time.positions("times", times, origin, units["time"]) if origin else numbers
             origin = origin or midnight
         times, y = (np.asarray(checks.unmask(values), float) for values in (times, self.y))
-        inputs = {name: _input_table(name, value, origin, units.get("time", "")) for name, value in self.inputs.items()}
+        inputs = {name: input_table(name, value, origin, units.get("time", "")) for name, value in self.inputs.items()}
         for name, value in {"times": times, "y": y, "outputs": tuple(self.outputs), "units": units, "inputs": inputs,
                             "origin": origin}.items():
             object.__setattr__(self, name, value)
@@ -226,8 +240,11 @@ class Data:
         return as_events(self.inputs)
 
 
-def _input_table(name: str, value: Any, origin: str | None, unit: str) -> InputTable:
-    """Return a known input, (times, values), (times, values, interpolation) or an `lfm.Input`, as a table."""
+def input_table(name: str, value: Any, origin: str | None, unit: str) -> InputTable:
+    """Return a known input, (times, values), (times, values, interpolation) or an `lfm.Input`, as a table.
+
+    Dates are counted from the ``origin`` in this unit; where the origin is None, times must be numbers.
+    """
     if isinstance(value, InputTable) and value.is_dose:
         return value
     if all(hasattr(value, part) for part in InputTable._fields[:3]):  # an Input
@@ -356,6 +373,22 @@ def in_unit(data: Data, unit: str) -> Data:
     if {unit, unit_of_data} <= set(calendar_time.SECONDS) and (
             calendar_time.UNITS[unit] != calendar_time.UNITS[unit_of_data]):
         return at_origin(data, data.origin, unit)
+    return data
+
+
+def on_clock_of_fit(data: Data, origin: str | None, unit: str, label: str) -> Data:
+    """Return later data with times on the clock of a fit; ``label`` names them in errors.
+
+    Raises:
+        ValueError: dates for numbers or numbers for dates, or a unit of time that cannot be converted.
+    """
+    if (data.origin is None) != (origin is None):
+        kinds = ("plain numbers", "dates") if data.origin is None else ("dates", "plain numbers")
+        raise ValueError(f"{label}: its times are {kinds[0]}, the times of the result {kinds[1]}; use the same form.")
+    data = in_unit(data, unit) if origin is None else at_origin(data, origin, unit)
+    if (unit_of_data := data.units.get("time", unit)) != unit:
+        raise ValueError(f"{label}: its times are in {unit_of_data}, which cannot be converted to the unit of the "
+                         f"result, {unit or 'none'}.")
     return data
 
 

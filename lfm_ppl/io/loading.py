@@ -112,8 +112,11 @@ class ModelFile:
             if argument not in parameters:
                 raise ValueError(f"{self.path}: the data have the {kind} {name!r}, and model(...) has no argument "
                                  f"`{argument}` to take {'them' if table.is_dose else 'it'} by.")
-        for name in self.inputs:
-            if name not in {key.partition(OF_SERIES)[0] for key in data.inputs}:
+        names = {key.partition(OF_SERIES)[0] for key in data.inputs}
+        has_doses = any(table.is_dose for table in data.inputs.values())
+        for name, way in self.inputs.items():
+            # Doses to other states than usual: where there is no such state the model names those that exist.
+            if name not in names and not (way.startswith(DOSE) and has_doses):
                 raise ValueError(f"{self.name} needs the known input {name!r}, which the data do not have.")
         return keywords | {name: value for name, value in from_data.items() if name in parameters}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import re
 from collections import Counter
@@ -101,16 +102,20 @@ def _remedy(cell: str) -> str:
     return ""
 
 
-def read_file(path: str | Path) -> Table:
-    """Read a comma-separated file; rows are numbered as an editor counts them."""
+def read_file(path: str | Path, most_rows: int | None = None) -> Table:
+    """Read a comma-separated file; rows are numbered as an editor counts them.
+
+    With ``most_rows`` nothing is read beyond that many rows that are no comments, the header included.
+    """
     import pandas as pd
 
     try:
         # pandas.read_csv fills short rows, cuts a cell at a comment character, and does not report lines.
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file, strict=True)
-            numbered = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-            rows = {line: cells for line, cells in numbered if any(cells) and not cells[0].startswith("#")}
+            numbered = ((reader.line_num, [cell.strip() for cell in row]) for row in reader)
+            rows = dict(itertools.islice(((line, cells) for line, cells in numbered
+                                          if any(cells) and not cells[0].startswith("#")), most_rows))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not a comma-separated text file (UTF-8): {error}. Save it as CSV in UTF-8."
                          ) from None

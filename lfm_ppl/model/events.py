@@ -86,7 +86,7 @@ class Event(eqx.Module):
     def check_target(self, state_names: Sequence[str]) -> None:
         """Raise ValueError unless the target is a state, or a direction in the space of the states."""
         if self.state is not None:
-            checks.one_of("the target of an event", self.state, state_names)
+            checks.one_of(f"state that receives {self.label}", self.state, state_names)
         elif self.direction is not None and np.shape(self.direction) != (len(state_names),):
             raise ValueError(f"the target of {self.label} must be the name of a state or a vector with an entry for "
                              f"each of the states {', '.join(state_names)}, got shape {np.shape(self.direction)}.")

@@ -14,11 +14,22 @@ import xarray as xr
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.likelihood_site import LikelihoodSite
-from lfm_ppl.io.data_set import InputTable, as_events, keywords_by_site, model_keywords
+from lfm_ppl.io.data_set import (
+    OF_SERIES,
+    InputTable,
+    as_events,
+    as_inputs,
+    continued_inputs,
+    input_table,
+    keywords_by_site,
+    model_keywords,
+)
+from lfm_ppl.model.inputs import Input
 from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.results.likelihoods import LikelihoodProblem
-from lfm_ppl.results.series import TIMES, times_of
-from lfm_ppl.results.sites import select_site
+from lfm_ppl.results.series import TIMES, is_selected_series, series_labels, times_of
+from lfm_ppl.results.sites import is_selected_site, select_site
+from lfm_ppl.utils import calendar_time
 
 _TOLERANCE = 1e-6
 """Relative difference of log likelihoods between machines and versions that is rounding."""
@@ -48,23 +59,117 @@ def keywords(result: Any, later: Mapping[str, Any] | None, overrides: Mapping[st
 
     Args:
         result: with the known inputs of the fit.
-        later: known inputs that reach further, see `lfm_ppl.forecast`; None: those of the fit.
+        later: known inputs that continue those of the fit, and further arguments, see `lfm_ppl.forecast`; or None.
         overrides: keyword arguments that replace these.
     """
     if sites := arviz_data.sites_of(result):
         return keywords_by_site({name: keywords(select_site(result, name), (later or {}).get(name), None)
                                  for name in sites}) | dict(overrides or {})
     stored = inputs.inputs_of(result)
-    doses = {name: InputTable(*value) for name, value in (later or {}).items()
-             if name in stored and stored[name].is_dose}
+    continued = stored | continued_tables(result, later or {})
     arguments = model_keywords(stored, overrides)
-    if doses:
-        arguments["events"] = as_events(stored | doses)
-    for name, value in (later or {}).items():
-        if name in doses:
+    others = {name: value for name, value in (later or {}).items() if name not in stored}
+    if len(others) < len(later or {}):
+        functions = as_inputs(continued)
+        for name, value in (later or {}).items():
+            if name in functions and isinstance(value, Input):
+                functions[name] = Input(*continued[name][:3], outside=value.outside, name=name)
+        from_tables = {"inputs": {**arguments.get("inputs", {}), **functions}, "events": as_events(continued)}
+        arguments |= {name: value for name, value in from_tables.items() if value}
+    return arguments | others
+
+
+def continued_tables(result: Any, later: Mapping[str, Any]) -> dict[str, InputTable]:
+    """Return the known inputs of a result of one site that later ones continue, by name, and the doses that they end.
+
+    Args:
+        result: with the known inputs of the fit.
+        later: name -> table, (times, values), (times, values, interpolation) or `lfm.Input`; other names are ignored.
+
+    Raises:
+        ValueError: a known input is read in another manner than in the fit, or differs from it before the last
+            observation.
+    """
+    stored, clock = inputs.inputs_of(result), inputs.clock_of(result)
+    tables = {name: _later_table(name, value, stored[name], clock) for name, value in later.items() if name in stored}
+    continued = continued_inputs(stored, tables)
+    for name, table in continued.items():
+        span = observed_span(result, name.partition(OF_SERIES)[2])
+        check_difference = _check_doses if table.is_dose else _check_function
+        with calendar_time.in_messages(*clock):
+            check_difference(name, stored[name], table, *span)
+    return continued
+
+
+def _later_table(name: str, value: Any, stored: InputTable, clock: tuple[str | None, str]) -> InputTable:
+    if isinstance(value, tuple) and not isinstance(value, InputTable) and len(value) == 2:
+        value = (*value, stored.interpolation)
+    table = input_table(name, value, *clock)
+    if table.times.ndim != 1 or table.times.shape != table.values.shape:
+        raise ValueError(f"the known input {name!r} must have one value for each time, (K,), got times of shape "
+                         f"{table.times.shape} and values of shape {table.values.shape}.")
+    if table.is_dose != stored.is_dose or not table.is_dose and table.interpolation != stored.interpolation:
+        raise ValueError(f"the known input {name!r} is read as {stored.interpolation!r} in the fit and as "
+                         f"{table.interpolation!r} in the forecast; read it in one manner.")
+    return table
+
+
+def observed_span(result: Any, series: str = "") -> tuple[float, float]:
+    """Return the times of the first row and of the last observation, of a series or of all; infinite without any."""
+    times, y = observations(result)
+    is_observed = np.isfinite(y).any(axis=-1)
+    times = np.broadcast_to(times, is_observed.shape)
+    if series:
+        index = list(map(str, series_labels(result))).index(series)
+        times, is_observed = times[index], is_observed[index]
+    return float(times.min()), float(np.max(times[is_observed], initial=-np.inf))
+
+
+def _check_function(name: str, stored: InputTable, table: InputTable, first: float, last: float) -> None:
+    """Raise ValueError where two known inputs differ between the first row and the last observation."""
+    is_linear = table.interpolation == "linear"
+    knots = np.unique(np.concatenate([stored.times, table.times, [first, last]]))
+    knots = knots[(knots >= first) & ((knots <= last) if is_linear else (knots < last))]
+
+    def values_at(table: InputTable) -> np.ndarray:
+        if is_linear:
+            return np.interp(knots, table.times, table.values)
+        return table.values[np.maximum(np.searchsorted(table.times, knots, side="right") - 1, 0)]
+
+    earlier, later = values_at(stored), values_at(table)
+    rounding = _TOLERANCE * np.max(np.abs(earlier), initial=0.0)
+    differing = np.flatnonzero(np.abs(earlier - later) > rounding)
+    if differing.size:
+        row = differing[0]
+        raise ValueError(f"the known input {name!r} of the forecast is {later[row]:g} at time {knots[row]:g}, where "
+                         f"that of the fit is {earlier[row]:g}. Until the last observation, at time {last:g}, they "
+                         "must be the same: give later rows only, which continue those of the fit, or fit again.")
+
+
+def _check_doses(name: str, stored: InputTable, table: InputTable, first: float, last: float) -> None:
+    """Raise ValueError where two tables of doses and resets differ before the last observation."""
+    def events(table: InputTable) -> dict[tuple[float, str], float]:
+        """Return the amounts that enter before the last observation, by time and state; resets by their time."""
+        amounts = {(float(time), "a reset"): 0.0 for time in (() if table.resets is None else table.resets)
+                   if time < last}
+        rows = zip(table.times, table.values, table.durations_of_all, table.compartments_of_all, strict=True)
+        for time, value, duration, compartment in rows:
+            if time < last:
+                fraction = min(duration, last - time) / duration if duration > 0 else 1.0
+                state = table.dosed_states[compartment]
+                amounts[float(time), state] = amounts.get((float(time), state), 0.0) + float(value * fraction)
+        return amounts
+
+    earlier, later = events(stored), events(table)
+    for time, state in sorted({*earlier, *later}):
+        amounts = [entries.get((time, state), np.nan) for entries in (later, earlier)]
+        if np.isclose(amounts[0], amounts[1], rtol=_TOLERANCE, atol=0.0):
             continue
-        arguments |= {"inputs": {**arguments["inputs"], name: value}} if name in stored else {name: value}
-    return arguments
+        given, fitted = ("none" if np.isnan(amount) else state if state == "a reset" else f"{amount:g} to {state}"
+                         for amount in amounts)
+        raise ValueError(f"the doses {name!r} of the forecast at time {time:g} are {given}, where those of the fit are "
+                         f"{fitted}. Before the last observation, at time {last:g}, they must be the same: give later "
+                         "doses only, which continue those of the fit, or fit again.")
 
 
 def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None,
@@ -76,6 +181,9 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
             settings, other parameters.
         TypeError: the model needs a keyword argument; the message names it.
     """
+    if is_selected_series(result) or is_selected_site(result):
+        raise ValueError("the result is one series of a panel or one of several likelihood sites, and its model is "
+                         "that of all; take the result that it was selected from.")
     posterior = arviz_data.group(result, "posterior")
     attrs = arviz_data.attributes(result)
     if times is None or y is None:

@@ -3,6 +3,7 @@
 1. The dimension of the series has the name of the plate, and is a dimension of ``observed_data``.
 2. Where series have times of their own, the coordinate ``times`` of a group holds them, one row for each series.
 3. `select_series` takes one entry of that dimension in every group, and drops the rows that pad the series.
+4. `panel_of` returns a panel for the model of all series, in which the other series have no data.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.io.data_set import OF_SERIES
-from lfm_ppl.results import arviz_data
-from lfm_ppl.results.scalars import units_attribute
+from lfm_ppl.results import arviz_data, inputs
+from lfm_ppl.results.scalars import unit_of, units_attribute
 from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:  # figures need no JAX
@@ -34,6 +35,9 @@ _OTHER_DIMENSIONS = ("chain", "draw", "time", "at", "at_truth", "output", "state
 
 _NOT_OF_SERIES = ("accuracy",)
 """Groups about the panel as a whole."""
+
+_PANEL = "selected_series"
+"""Attribute of a selected series: what `panel_of` needs besides its groups, as JSON."""
 
 
 def plate_dimension(bound: BoundModel) -> str | None:
@@ -80,7 +84,8 @@ def select_series(result: Any, series: Any) -> Any:
 
     Returns:
         An ArviZ object with the names and dimensions of a result of one series. Its attribute ``selected``
-        names the series. `lfm_ppl.forecast` and `lfm_ppl.check_accuracy` take the panel instead, whose model it is.
+        names the series. `lfm_ppl.forecast` takes it with the model of the panel; `lfm_ppl.check_accuracy` takes the
+        panel instead.
 
     Raises:
         ValueError: the result is of one series, or has no such series.
@@ -114,15 +119,83 @@ def select_series(result: Any, series: Any) -> Any:
             dataset = dataset.isel(time=has_scores)
         elif label in ("observed_data", "one_step_ahead", "posterior_predictive"):
             dataset = dataset.isel(time=is_observed[index] | is_later)
-        elif label == "constant_data":
-            names = {str(name): str(name).partition(OF_SERIES) for name in dataset}
-            dataset = dataset[[name for name, (_, _, owner) in names.items() if owner in ("", str(labels[index]))]]
+        elif label in (inputs.GROUP, inputs.FORECAST):
+            dataset = _select_inputs(result, label, str(labels[index]))
         elif label == "predictions":
             last = np.max(times[is_observed[index]], initial=-np.inf)
             dataset = dataset.assign_attrs(last_observation=float(last))
         groups[label] = dataset
-    attrs = _select_mode(arviz_data.attributes(result), arviz_data.group(result, "posterior"), dimension, index)
-    return arviz_data.build(groups, attrs | {"selected": f"{dimension} {labels[index]}"})
+    posterior = arviz_data.group(result, "posterior")
+    attrs = _select_mode(arviz_data.attributes(result), posterior, dimension, index)
+    panel = {"dimension": dimension, "labels": labels, "index": index, "has_series_times": TIMES in observed.variables,
+             "has_labels": dimension in observed.coords,
+             "rows": observed.sizes["time"],
+             "axes": {str(label): variable.dims.index(dimension) for label, variable in posterior.data_vars.items()
+                      if dimension in variable.dims},
+             "inputs": sorted({label.partition(OF_SERIES)[0] for label in inputs.inputs_of(result)
+                               if OF_SERIES in label})}
+    return arviz_data.build(groups, attrs | {"selected": f"{dimension} {labels[index]}", _PANEL: json.dumps(panel)})
+
+
+def is_selected_series(result: Any) -> bool:
+    """Return whether a result is one series of a panel, from `select_series`."""
+    return _PANEL in arviz_data.attributes(result)
+
+
+def panel_of(result: Any) -> tuple[Any, Any]:
+    """Return a panel in which the other series have no data, and the label of the selected series.
+
+    The other series have its times, known inputs and parameters, for a model that needs numbers of all series.
+    """
+    attrs = arviz_data.attributes(result)
+    panel = json.loads(attrs[_PANEL])
+    dimension, labels, index = panel["dimension"], panel["labels"], panel["index"]
+    is_selected = xr.DataArray(np.arange(len(labels)) == index, dims=dimension)
+
+    def without_others(dataset: xr.Dataset, fill: float) -> xr.Dataset:
+        # Rows pad the series again, so that its draws are those of a forecast of the panel.
+        rows, size = np.arange(panel["rows"]), dataset.sizes["time"]
+        dataset = dataset.isel(time=np.minimum(rows, size - 1)).where(xr.DataArray(rows < size, dims="time"), fill)
+        names = list(dataset.data_vars)
+        filled = dataset.assign({name: dataset[name].where(is_selected, fill).transpose(*lead, dimension, ...)
+                                 for name in names for lead in [[dim for dim in ("chain", "draw")
+                                                                 if dim in dataset[name].dims]]})
+        if panel["has_series_times"]:
+            times = np.tile(dataset["time"].values, (len(labels), 1))
+            filled = filled.drop_vars("time").assign_coords(
+                {TIMES: ((dimension, "time"), times, dataset["time"].attrs)})
+        return filled.assign_coords({dimension: labels}) if panel["has_labels"] else filled
+
+    posterior, observed = (arviz_data.group(result, name) for name in ("posterior", "observed_data"))
+    repeated = {name: posterior[name].expand_dims({dimension: len(labels)}, axis)
+                for name, axis in panel["axes"].items()}
+    groups = {"posterior": posterior.assign(repeated),
+              "observed_data": without_others(observed, np.nan)}
+    if arviz_data.has_group(result, "one_step_ahead"):
+        groups["one_step_ahead"] = without_others(arviz_data.group(result, "one_step_ahead"), 0.0)
+    if arviz_data.has_group(result, inputs.GROUP):
+        groups[inputs.GROUP] = inputs.to_dataset(of_all_series(result, inputs.inputs_of(result)))
+    return arviz_data.build(groups, {name: value for name, value in attrs.items()
+                                     if name not in (_PANEL, "selected", arviz_data.MODE, arviz_data.DEGENERATE)}
+                            ), labels[index]
+
+
+def of_all_series(result: Any, tables: Mapping[str, Any]) -> dict[str, Any]:
+    """Return known inputs of a selected series under the names that its panel has for them, the same for all series."""
+    panel = json.loads(arviz_data.attributes(result)[_PANEL])
+    return {label: value for name, value in tables.items()
+            for label in ([f"{name}{OF_SERIES}{series}" for series in panel["labels"]] if name in panel["inputs"]
+                          else [name])}
+
+
+def _select_inputs(result: Any, group: str, series: str) -> xr.Dataset:
+    """Return the known inputs of a series, without its label in their names."""
+    stored = arviz_data.group(result, group)
+    names = {name: name.partition(OF_SERIES) for name in inputs.inputs_of(result, group)}
+    owned = {name: short for name, (short, _, owner) in names.items() if owner in ("", series)}
+    tables = {owned[name]: table for name, table in inputs.inputs_of(result, group).items() if name in owned}
+    units = {short: unit_of(stored[name]) for name, short in owned.items()}
+    return inputs.to_dataset(tables, {name: unit for name, unit in units.items() if unit})
 
 
 def _position(labels: list[Any], series: Any) -> int:

@@ -3,15 +3,18 @@
 1. Parameters, statistics of the sampler and the accuracy check are common to all sites.
 2. Groups of observations hold one variable for each site, with dimensions of its own: ``y`` over ``y_time``.
 3. Every other group belongs to one site and has its name: ``trajectories_y``.
+4. `select_site` keeps the data of the other sites in groups of their own, which the model needs for a forecast.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from typing import Any
 
 import xarray as xr
 
-from lfm_ppl.results import arviz_data
+from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.types import Result
 
@@ -24,6 +27,12 @@ _OBSERVED = ("observed_data", "log_likelihood", "posterior_predictive")
 _OF_SITE = ("one_step_ahead", "trajectories", "predictions", "truth", "constant_data", "predictions_constant_data",
             "held_out_data")
 """Groups that each site has for itself."""
+
+_OTHERS = "other_sites"
+"""Group of a selected site with the observations of the other ones, named as in a result with several sites."""
+
+_SELECTED = "selected_site"
+"""Attribute of a selected site: its name and the settings of all sites, as JSON."""
 
 _VARIABLE = "y"
 """Name of the observations in the view of a site."""
@@ -58,7 +67,8 @@ def select_site(result: Result, name: str) -> Result:
         name: name of the site.
 
     Returns:
-        An ArviZ object with the groups of `lfm_ppl.fit`; it shares the arrays of ``result``.
+        An ArviZ object with the groups of `lfm_ppl.fit`; it shares the arrays of ``result``. `lfm_ppl.forecast` takes
+        it with the model of all sites, whose data are in its groups ``other_sites`` and ``constant_data_SITE``.
 
     Raises:
         ValueError: the result has no such site.
@@ -89,9 +99,38 @@ def select_site(result: Result, name: str) -> Result:
             part = dataset[[variable for variable in (stored, f"{stored}_times") if variable in dataset]]
             names = {label: str(label).removeprefix(f"{stored}_") for label in (*part.variables, *part.dims)}
             groups[group] = part.rename(names | {stored: _VARIABLE})
+            if group == "observed_data":
+                groups[_OTHERS] = dataset.drop_vars([label for label in dataset.variables if label in names])
         elif group != kind and kind in _OF_SITE:
             groups[kind] = dataset.rename({stored: _VARIABLE}) if stored in dataset else dataset
             if "observed" in dataset.attrs:
                 groups[kind] = groups[kind].assign_attrs(observed=_VARIABLE)
+        elif group.startswith(f"{inputs.GROUP}_"):
+            groups[group] = dataset
     attributes = {key: value for key, value in arviz_data.attributes(result).items() if key != arviz_data.LIKELIHOODS}
-    return arviz_data.build(groups, attributes | settings[name])
+    selected = json.dumps({"name": name, "sites": settings})
+    return arviz_data.build(groups, attributes | settings[name] | {_SELECTED: selected})
+
+
+def is_selected_site(result: Any) -> bool:
+    """Return whether a result is one site of several, from `select_site`."""
+    return _SELECTED in arviz_data.attributes(result)
+
+
+def all_sites_of(result: Any) -> tuple[Any, str]:
+    """Return the result of all sites with the parameters and the data that a model needs, and the selected site."""
+    attributes = arviz_data.attributes(result)
+    selected = json.loads(attributes[_SELECTED])
+    name, settings = selected["name"], selected["sites"]
+    stored = name.replace("/", ".")
+    own = {group: arviz_data.group(result, group) for group in ("posterior", "observed_data", "one_step_ahead",
+                                                                inputs.GROUP) if arviz_data.has_group(result, group)}
+    own["observed_data"] = own["observed_data"].rename({_VARIABLE: name})
+    groups = merge_sites({name: own})
+    if arviz_data.has_group(result, _OTHERS):
+        groups["observed_data"] = groups["observed_data"].merge(arviz_data.group(result, _OTHERS))
+    groups |= {group: arviz_data.group(result, group) for group in arviz_data.groups(result)
+               if group.startswith(f"{inputs.GROUP}_") and group != f"{inputs.GROUP}_{stored}"}
+    differing = {key for site in settings.values() for key in site}
+    attributes = {key: value for key, value in attributes.items() if key not in (_SELECTED, *differing)}
+    return arviz_data.build(groups, {**attributes, arviz_data.LIKELIHOODS: json.dumps(settings)}), name

@@ -12,7 +12,7 @@ import numpy as np
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.posterior import noise_of_rows
+from lfm_ppl.inference.posterior import has_noise_of_rows
 from lfm_ppl.io.data import as_data
 from lfm_ppl.io.data_set import Data, at_origin, in_unit, keywords_by_site, model_keywords
 from lfm_ppl.io.table import is_table
@@ -248,8 +248,8 @@ def check_requested_times(bound: BoundModel, times: Any, name: str = "at") -> No
 
 def warn_of_missing_predictions(bound: BoundModel, times: Any) -> None:
     """Warn where new observations at the times of the trajectories have no distribution."""
-    if times is None or np.array_equal(np.asarray(times, float), bound.times) or not noise_of_rows(bound.site.example):
+    if times is None or np.array_equal(np.asarray(times, float), bound.times) or not has_noise_of_rows(bound):
         return
-    checks.warn("at: the noise is given for each row of the data, so that new observations at these times cannot be "
+    checks.warn("at: the noise differs between the rows of the data, so that new observations at these times cannot be "
                 "predicted; the result has trajectories there, and no group `predictions`. For predictions give a "
                 "function (x, u, t) or one number for all rows as covariance.")

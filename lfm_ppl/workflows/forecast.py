@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.inference.posterior import evenly_spaced, noise_of_rows, trajectories
-from lfm_ppl.io.data_set import InputTable
-from lfm_ppl.model.inputs import Input
+from lfm_ppl.inference.posterior import evenly_spaced, has_noise_of_rows, trajectories
+from lfm_ppl.io.data_set import OF_SERIES, Data, on_clock_of_fit
+from lfm_ppl.model.events import Event
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results import inputs as known_inputs
 from lfm_ppl.results.likelihoods import LikelihoodProblem
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
-from lfm_ppl.results.series import series_dimension
-from lfm_ppl.results.sites import select_site
+from lfm_ppl.results.series import is_selected_series, of_all_series, panel_of, select_series, series_dimension
+from lfm_ppl.results.sites import all_sites_of, is_selected_site, select_site
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import Console
 from lfm_ppl.utils.random_keys import split_by_name
@@ -27,7 +28,8 @@ from lfm_ppl.workflows.data_binding import check_requested_times, of_site
 from lfm_ppl.workflows.fit_options import keys_of
 
 
-def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: Mapping[str, Any] | None = None,
+def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: Mapping[str, Any] | Data | None = None,
+             events: Sequence[Event] | Mapping[str, Sequence[Event]] = (),
              model_kwargs: Mapping[str, Any] | None = None, draws: int = 400, seed: int = 0,
              progress: bool = True) -> Result:
     """Predict new observations, with their noise, between the data and after them.
@@ -49,18 +51,30 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
     draws of the noise.
 
     Args:
-        result: of `lfm_ppl.fit`, or read by `lfm_ppl.load`.
-        numpyro_model: the model that was fitted. A result holds draws and data, but no code.
+        result: of `lfm_ppl.fit`, or read by `lfm_ppl.load`; also one series or one likelihood site of it, from
+            `lfm_ppl.select_series` or `lfm_ppl.select_site`, which is predicted alone.
+        numpyro_model: the model that was fitted, of all series and sites. A result holds draws and data, but no code.
         times: (K,) times of the forecast, non-decreasing, from the initial time on; dates if the data have dates.
             (B, K) where the series of a panel have times of their own. With several likelihood sites for all of them,
             or a dict for some.
-        inputs: known inputs (`lfm_ppl.Input`) that reach as far as ``times``, and are the same as before at the data:
-            inputs by name, or keyword arguments of the model, that replace the ones of the result. Doses are
-            (times, amounts, "dose:STATE"), with all those before. With several likelihood sites a dict by site.
+        inputs: what goes on after the fit, by name, see below; or a `lfm_ppl.Data` with later known inputs, whose times
+            are converted to the clock of the fit. With several likelihood sites a dict by site.
+        events: `lfm_ppl.Dose`, `lfm_ppl.Infusion` and `lfm_ppl.Reset` after the last observation, which follow those of
+            the fit in the argument ``events`` of the model. With several likelihood sites a dict by site.
         model_kwargs: keyword arguments of the model, as in the fit.
         draws: number of posterior draws, spread over the chains, each with a path of its own.
         seed: of the paths and the noise.
         progress: show on standard error how far it is.
+
+    Known inputs and doses of the data CONTINUE those of the fit: the rows of the fit before the first time of the new
+    table stay, and the new rows follow. A table that begins with, or before, that of the fit replaces it. Until the
+    last observation both must be the same, since the posterior belongs to them. A table is (times, values), (times,
+    values, interpolation) or an `lfm_ppl.Input`, and of doses (times, amounts, "dose:STATE"). In a panel each series
+    has its own, under the name ``"dose of series Ann"``.
+
+    Keyword arguments of the model that the data do not hold are REPLACED. But arrays with a row for each row of the
+    data in ``model_kwargs``, such as the noise of each measurement, continue with the rows given in ``inputs``, one for
+    each of ``times``, which then come after the data.
 
     Returns:
         A new ArviZ object: the groups of ``result`` and a group ``predictions`` with dimensions chain, draw, time and
@@ -72,8 +86,9 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
 
     Raises:
         ValueError: times that go back or lie before the initial time; another model than that of the result, seen by
-            its settings, its parameters or its log likelihood at the draws; a known input that ends before ``times``;
-            noise whose covariance is given row by row.
+            its settings, its parameters or its log likelihood at the draws; a known input that ends before ``times``,
+            that is unknown, or that differs from the fit before the last observation; noise that is given row by row,
+            differs between rows, and is not continued; an event before the last observation.
         TypeError: ``result`` is no ArviZ object; the model needs a keyword argument.
 
     Warns:
@@ -100,29 +115,152 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
     (2019), Applied Stochastic Differential Equations, chapter 9, for Gaussian moments and what they miss.
     """
     checks.positive_integer("draws", draws)
+    if is_selected_series(result) or is_selected_site(result):
+        options: dict[str, Any] = {"events": events, "model_kwargs": model_kwargs, "draws": draws, "seed": seed,
+                                   "progress": progress}
+        return _forecast_selected(result, numpyro_model, times, inputs, options)
     sites = list(arviz_data.sites_of(result))
     requested = {name: of_site("times", times, name, sites) for name in sites} if sites else {"": times}
     views = {name: select_site(result, name) if sites else result for name in requested}
     clocks = {name: known_inputs.clock_of(view) for name, view in views.items()}
     requested = {name: _checked(calendar_time.positions("times", values, *clocks[name]))
                  for name, values in requested.items() if values is not None}
-    later: Mapping[str, Any] = inputs or {}
+    later = {name: _inputs_by_name(view, of_site("inputs", inputs, name, sites), numpyro_model, clocks[name])
+             for name, view in views.items()}
     if sites:
-        later = {name: of_site("inputs", inputs, name, sites) for name in sites}
-    keywords = rebuilding.keywords(result, later, model_kwargs)
+        later = {name: later.get(name, {}) for name in sites}
+    data = dict(zip(("times", "y"), rebuilding.observations(result), strict=True))
+    has_rows = {}
+    for name, when in requested.items():
+        later[name], has_rows[name] = _continued_rows(later[name], model_kwargs or {}, views[name], when)
+        if has_rows[name]:
+            extended = _with_later_rows(views[name], when)
+            data = {key: {**data[key], name: value} if sites else value for key, value in extended.items()}
+    keywords = rebuilding.keywords(result, later if sites else later[""], model_kwargs)
+    for name, view in views.items():
+        if site_events := of_site("events", events, name, sites):
+            _check_events(view, site_events, numpyro_model)
+            earlier = keywords.get("events", {} if sites else ())
+            keywords["events"] = ({**earlier, name: [*earlier.get(name, ()), *site_events]} if sites
+                                  else [*earlier, *site_events])
     with calendar_time.in_messages(*next(iter(clocks.values()))):
-        problem = rebuilding.problem(result, numpyro_model, model_kwargs=keywords)
+        problem = rebuilding.problem(result, numpyro_model, model_kwargs=keywords, **data)
     groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)}
     keys = split_by_name(keys_of(seed)["forecasts"], requested)
     for name in requested:
         suffix = f"_{name.replace('/', '.')}" if sites else ""
         with calendar_time.in_messages(*clocks[name]):
             new = _forecast(keys[name], views[name], problem.sites[name] if sites else problem, requested[name],
-                            later[name] if sites else later, draws, progress)
+                            draws, progress, has_rows[name])
+        if continued := rebuilding.continued_tables(views[name], later[name]):
+            new[known_inputs.FORECAST] = known_inputs.to_dataset(continued)
         # Held-out data of an earlier forecast do not belong to this one.
         for group in (HELD_OUT, known_inputs.FORECAST):
             groups.pop(f"{group}{suffix}", None)
         groups |= {f"{group}{suffix}": dataset for group, dataset in new.items()}
+    return arviz_data.build(groups, arviz_data.attributes(result))
+
+
+def _inputs_by_name(result: Result, inputs: Mapping[str, Any] | Data | None, numpyro_model: Callable,
+                    clock: tuple[str | None, str]) -> dict[str, Any]:
+    """Return later known inputs and keyword arguments by name, with tables of data on the clock of the fit.
+
+    Raises:
+        ValueError: neither the result nor the model has an input of this name.
+    """
+    if isinstance(inputs, Data):
+        inputs = on_clock_of_fit(inputs, *clock, "inputs").inputs
+    stored = known_inputs.inputs_of(result)
+    arguments = _arguments(numpyro_model)
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in arguments.values())
+    for name in inputs or {}:
+        is_argument = name in arguments or takes_any
+        if name in stored or is_argument and not any(label.startswith(f"{name}{OF_SERIES}") for label in stored):
+            continue
+        of_series = " Each series of a panel has its own." if any(OF_SERIES in label for label in stored) else ""
+        raise ValueError(f"inputs: {checks.unknown('known input', name, [*stored, *arguments])}{of_series}")
+    return dict(inputs or {})
+
+
+def _check_events(result: Result, events: Sequence[Event], numpyro_model: Callable) -> None:
+    """Raise ValueError unless events come after the last observation of one series, and the model takes them."""
+    if series_dimension(result) is not None:
+        raise ValueError("events: each series of a panel has doses of its own; give inputs={'NAME of series LABEL': "
+                         "(times, amounts, 'dose:STATE')}, which continue those of the data.")
+    if "events" not in _arguments(numpyro_model):
+        raise ValueError("events: the model has no argument `events` to take them by.")
+    _, last = rebuilding.observed_span(result)
+    for event in events:
+        if not isinstance(event, Event):
+            raise TypeError(f"events must be lfm.Dose, lfm.Infusion or lfm.Reset, got {type(event).__name__}.")
+        if np.min(event.event_times, initial=np.inf) < last:
+            raise ValueError(f"events: {event.label} at time {np.min(event.event_times):g} lies before the last "
+                             f"observation, at time {last:g}; events of the forecast follow those of the fit.")
+
+
+def _arguments(numpyro_model: Callable) -> dict[str, inspect.Parameter]:
+    """Return the parameters of a model after times and y, by name."""
+    while hasattr(numpyro_model, "fn"):  # an effect handler
+        numpyro_model = numpyro_model.fn
+    return dict(list(inspect.signature(numpyro_model).parameters.items())[2:])
+
+
+def _continued_rows(later: Mapping[str, Any], model_kwargs: Mapping[str, Any], result: Result,
+                    times: np.ndarray) -> tuple[dict[str, Any], bool]:
+    """Return later arguments, of which rows follow those of the fit, and whether any do.
+
+    An argument has rows if its array in ``model_kwargs`` has one for each row of the data, (T, ...), or of a panel
+    (B, T, ...). The later array then has one for each of ``times`` (K,) or (B, K).
+    """
+    _, y = rebuilding.observations(result)
+    stored, rows = known_inputs.inputs_of(result), y.shape[:-1]
+    arguments, has_rows = dict(later), False
+    for name, value in later.items():
+        earlier: Any = model_kwargs.get(name)
+        if name in stored or not all(isinstance(array, np.ndarray | jax.Array) for array in (value, earlier)):
+            continue
+        lead = len(rows) if earlier.shape[:len(rows)] == rows else 1
+        if earlier.ndim == 0 or earlier.shape[:lead] != rows[-lead:]:
+            continue
+        expected = (*earlier.shape[:lead - 1], times.shape[-1], *earlier.shape[lead:])
+        if value.shape != expected:
+            raise ValueError(f"inputs: {name!r} has shape {value.shape}, expected {expected}, a row for each time of "
+                             "the forecast, which follows those of the data in model_kwargs.")
+        arguments[name], has_rows = np.concatenate([earlier, value], axis=lead - 1), True
+    return arguments, has_rows
+
+
+def _with_later_rows(result: Result, later_times: np.ndarray) -> dict[str, np.ndarray]:
+    """Return times and observations of a result of one site, followed by rows without observations.
+
+    Raises:
+        ValueError: a later time is not after the data.
+    """
+    times, y = rebuilding.observations(result)
+    later = np.broadcast_to(later_times, (*times.shape[:-1], later_times.shape[-1]))
+    if (later[..., :1] < times[..., -1:]).any():
+        raise ValueError(f"times: rows of arguments that follow those of the data are for times after the data, which "
+                         f"end at {times[..., -1].max():g}, got {later.min():g}.")
+    missing = np.full((*y.shape[:-2], later.shape[-1], y.shape[-1]), np.nan)
+    return {"times": np.concatenate([times, later], axis=-1), "y": np.concatenate([y, missing], axis=-2)}
+
+
+def _forecast_selected(result: Result, numpyro_model: Callable, times: Times, inputs: Mapping[str, Any] | Data | None,
+                       options: Mapping[str, Any]) -> Result:
+    """Return a selected series or site with its forecast by the model of the panel or of all sites."""
+    if is_selected_series(result):
+        panel, label = panel_of(result)
+        later = _inputs_by_name(result, inputs, numpyro_model, known_inputs.clock_of(result))
+        ahead = select_series(forecast(panel, numpyro_model, times, inputs=of_all_series(result, later), **options),
+                              label)
+    else:
+        whole, name = all_sites_of(result)
+        options = {**options, "events": {name: options["events"]}}
+        ahead = select_site(forecast(whole, numpyro_model, {name: times}, inputs={name: inputs}, **options), name)
+    groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)
+              if name not in (GROUP, HELD_OUT, known_inputs.FORECAST)}
+    groups |= {name: arviz_data.group(ahead, name) for name in (GROUP, known_inputs.FORECAST)
+               if arviz_data.has_group(ahead, name)}
     return arviz_data.build(groups, arviz_data.attributes(result))
 
 
@@ -134,10 +272,10 @@ def _checked(times: Any) -> np.ndarray:
 
 
 def _forecast(key: jax.Array, result: Any, problem: LikelihoodProblem, times: np.ndarray,
-              inputs: Mapping[str, Any] | None, draws: int, progress: bool) -> dict[str, xr.Dataset]:
-    """Return the groups of a forecast of one site."""
+              draws: int, progress: bool, has_rows: bool) -> dict[str, xr.Dataset]:
+    """Return the groups of a forecast of one site; ``has_rows`` if the last rows of the data are those of ``times``."""
     bound = problem.bound
-    check_possible(bound, times)
+    check_possible(bound, times, has_rows)
     posterior = arviz_data.group(result, "posterior")
     chains = posterior.sizes["chain"]
     draw_index, rows = evenly_spaced(chains, posterior.sizes["draw"], draws)
@@ -145,8 +283,11 @@ def _forecast(key: jax.Array, result: Any, problem: LikelihoodProblem, times: np
     settings = None
     if str(attrs.get("sampler", "")).startswith("pmmh") and "particles" in attrs:
         settings = ParticleSettings(int(attrs["particles"]))
-    paths = trajectories(key, bound, problem.select(rows).draws, times, settings,
+    paths = trajectories(key, bound, problem.select(rows).draws, None if has_rows else times, settings,
                          report=Console() if progress else None)
+    if has_rows:
+        paths = {name: value if name in ("y", "log_likelihood") else value[..., -times.shape[-1]:, :]
+                 for name, value in paths.items()}
     split = {name: value.reshape(chains, len(draw_index), *value.shape[1:]) for name, value in paths.items()}
     log_likelihood = split.pop("log_likelihood", None)
     # The log likelihood of an observation family depends on the times of the forecast in its last digits.
@@ -156,25 +297,21 @@ def _forecast(key: jax.Array, result: Any, problem: LikelihoodProblem, times: np
     observed = arviz_data.group(result, "observed_data")
     series = series_dimension(result)
     names = {str(name): observed[name].values.tolist() for name in ("output", series) if name in observed.coords}
-    groups = {GROUP: predictions(bound, split, posterior["draw"].values[draw_index], times, names, series)}
-    if continued := {name: InputTable(*value) if isinstance(value, tuple) else InputTable(
-            np.asarray(value.times), np.asarray(value.values), value.interpolation)
-                     for name, value in (inputs or {}).items() if isinstance(value, Input | tuple)}:
-        groups[known_inputs.FORECAST] = known_inputs.to_dataset(continued)
-    return groups
+    return {GROUP: predictions(bound, split, posterior["draw"].values[draw_index], times, names, series)}
 
 
-def check_possible(bound: Any, times: np.ndarray) -> None:
-    """Raise where new observations at these times have no distribution.
+def check_possible(bound: Any, times: np.ndarray, has_rows: bool = False) -> None:
+    """Raise where new observations at these times have no distribution; ``has_rows`` if these are rows of the data.
 
     Raises:
         ValueError: see `forecast`.
     """
-    example = bound.site.example
-    if noise_of_rows(example):
+    if not has_rows and has_noise_of_rows(bound):
         raise ValueError("the covariance of the observation, (T, D, D), or a parameter of its family, (T, D), is given "
-                         "for each row of the data, so that there is none at other times. For a forecast give a "
-                         "function (x, u, t) as covariance, or one number for all rows; what differs from row to row, "
-                         "such as an exposure, can be a known input of the predictor.")
+                         "for each row of the data and differs between rows, so that there is none at other times. "
+                         "Give later rows of a keyword argument R of the model, one for each time: model_kwargs={'R': "
+                         "rows of the fit}, inputs={'R': later rows}; or a function (x, u, t) or one number as "
+                         "covariance, or an exposure as a known input of the predictor.")
     check_requested_times(bound, times, "times")
-    example.ssm.model.check_span(float(bound.times.min()), float(max(times.max(), bound.times.max())))
+    model = bound.site.example.ssm.model
+    model.check_span(float(bound.times.min()), float(max(times.max(), bound.times.max())))

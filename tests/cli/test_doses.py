@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 import lfm_ppl as lfm
@@ -74,6 +75,13 @@ def test_a_column_without_a_state_is_refused(files, run):
     assert status == 2 and "--events takes COLUMN:STATE" in errors
 
 
+@pytest.mark.parametrize("name", ["pharmacokinetics", "drug.py"])
+def test_a_state_that_does_not_exist_is_named(files, run, name):
+    model = name if name == "pharmacokinetics" else files / name
+    status, _, errors = run(f"fit {model} --data {files}/drug.csv --outputs blood --events AMT:gutt --sampler map")
+    assert status == 2 and "'gutt'" in errors and "gut, blood" in errors and errors.count("\n") == 1, errors
+
+
 PANEL = MODEL.replace("""    ke = numpyro.sample("ke", dist.LogNormal(-1.0, 0.5))
     system = lfm""", """    def build(p):
       ke = p["ke"]
@@ -99,5 +107,18 @@ def test_subjects_of_a_file_are_fitted_together_with_their_doses(files, run):
     doses = arviz_data.group(result, "constant_data")
     assert doses["AMT of series Ann"].values.tolist() == [4.0] and doses["AMT of series Bo"].values.tolist() == [4.0]
     assert "trajectories" in arviz_data.groups(result)
-    alone = arviz_data.group(lfm.select_series(result, "Ann"), "constant_data")
-    assert list(alone) == ["AMT of series Ann"]
+    assert list(arviz_data.group(lfm.select_series(result, "Ann"), "constant_data")) == ["AMT"]
+    # Bo alone, whose rows begin later, with a further dose; the panel with the doses of both.
+    lfm.save(lfm.select_series(result, "Bo"), files / "bo")
+    status, _, errors = run(f"forecast bo --held-out {files}/later.csv --events AMT:gut --draws 10 --out ahead")
+    assert status == 0, errors
+    ahead = arviz_data.load("ahead")
+    alone = arviz_data.group(ahead, "predictions")["outputs"][..., 0]
+    assert alone.dims == ("chain", "draw", "time") and alone["time"].values.tolist() == [12.0, 14.0]
+    assert arviz_data.group(ahead, "predictions_constant_data")["AMT"].values.tolist()[-2:] == [4.0, 4.0]
+    again = lfm.forecast(lfm.select_series(result, "Bo"), load(str(files / "panel.py")).model, [12.0, 14.0], draws=10,
+                         inputs={"AMT": ([8.0, 12.0], [4.0, 4.0], "dose:gut")}, progress=False)
+    np.testing.assert_allclose(arviz_data.group(again, "predictions")["outputs"][..., 0], alone)
+    rate = float(arviz_data.group(lfm.select_series(result, "Bo"), "posterior")["ke"][0, 0])
+    expected = sum(4 * 1.3 / (1.3 - rate) * (np.exp(-rate * gap) - np.exp(-1.3 * gap)) for gap in (6.0, 2.0))
+    assert float(alone[0, 0, 1]) == pytest.approx(expected, rel=1e-6)

@@ -323,6 +323,19 @@ def test_a_later_reset_ends_an_infusion_that_runs(read):
     assert tables["iv"].durations.tolist() == [5.0, 0.0, 0.0] and tables["AMT"].resets.tolist() == [5.0]
 
 
+def test_a_later_reset_ends_infusions_of_doses_that_are_not_named_later(read):
+    infusion = InputTable(np.array([0.0, 2.0]), np.array([10.0, 3.0]), "dose:blood", np.array([20.0, 0.0]))
+    reset = InputTable(np.zeros(0), np.zeros(0), "dose:gut", None, None, np.array([5.0]))
+    dose = InputTable(np.array([0.0]), np.array([1.0]), "dose:gut")
+    tables = continued_inputs({"AMT": dose, "iv": infusion}, {"AMT": reset})
+    assert tables["iv"].durations.tolist() == [5.0, 0.0] and tables["iv"].values.tolist() == [2.5, 3.0]
+    assert list(continued_inputs({"AMT": dose, "iv": infusion}, {"AMT": dose})) == ["AMT"]
+    # A reset of one series of a panel is none of the others.
+    names = [f"{name} of series {label}" for name in ("AMT", "iv") for label in ("Ann", "Bo")]
+    panel = dict(zip(names, (dose, dose, infusion, infusion), strict=True))
+    assert set(continued_inputs(panel, {names[1]: reset})) == {names[1], names[3]}
+
+
 def test_the_command_line_names_states_and_roles():
     model = load("pharmacokinetics")
     assert choices.inputs(Columns(events="AMT:gut"), model) == {"dose": ("AMT", "dose:gut")}

@@ -247,6 +247,38 @@ def test_a_short_forecast_shows_the_last_rows_and_held_out_data(datasets):
     assert not lines(whole, "last observation") and the_line(whole, "data").get_xdata().min() == 0.0
 
 
+def test_doses_are_marked_and_their_rows_are_not_missing(datasets):
+    y = datasets["observed_data"]["y"]
+    times, empty = y["time"].values, y.copy()
+    empty.values[[0, 3]] = np.nan
+    datasets["observed_data"] = datasets["observed_data"].assign(y=empty)
+    dose = InputTable(times[[0, 2]], np.array([4.0, 2.0]), "dose:gut", np.array([0.0, 1e3]), None, times[[3]])
+    heater = InputTable(times[[0, 3]], np.array([0.0, 2.0]))
+    plain = plot_fit(arviz_data.build({**datasets, "constant_data": to_dataset({"heater": heater})})).axes[0]
+    marked = plot_fit(arviz_data.build({**datasets, "constant_data": to_dataset({"dose": dose, "heater": heater})}))
+    missing, without = (the_line(axes, "missing").get_xdata() for axes in (plain, marked.axes[0]))
+    np.testing.assert_array_equal(np.setdiff1d(missing, without), times[[0, 3]])
+    assert {"dose", "infusion", "reset"} <= legend_texts(marked)
+    np.testing.assert_array_equal(the_line(marked.axes[0], "dose").get_xdata(), times[[0]])
+    np.testing.assert_array_equal(the_line(marked.axes[0], "reset").get_xdata(), times[[3]])
+    assert marked.axes[0].get_xlim() == plain.get_xlim()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_curves_at_few_times_are_bars_and_lines(datasets, count):
+    paths = datasets["trajectories"].isel(at=np.arange(count))
+    keep = {name: datasets[name] for name in ("observed_data", "posterior_predictive") if name in datasets}
+    for plot in (plot_fit, plot_forces):
+        axes = plot(arviz_data.build({**keep, "trajectories": paths})).axes[0]
+        mean = the_line(axes, "posterior mean")
+        bars = [collection for collection in axes.collections if isinstance(collection, LineCollection)]
+        assert len(bars[-1].get_segments()) == count
+        joined = [line for line in axes.lines if len(line.get_xdata()) == count and line.get_linestyle() == "-"]
+        joined = [line for line in joined if line is not mean]
+        assert len(joined) == (count > 1)
+        assert count == 1 or np.allclose(joined[0].get_ydata(), mean.get_ydata()[np.isfinite(mean.get_ydata())])
+
+
 def test_known_inputs_are_drawn_as_they_are_read_and_held(result):
     tables = {"heater": InputTable(np.array([0.0, 6.0]), np.array([0.0, 2.0]), "previous"),
               "outside": InputTable(np.array([0.0, 24.0]), np.array([3.0, 5.0]), "linear")}

@@ -9,10 +9,13 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 import systems
+import xarray as xr
 from scipy import stats
 
 import lfm_ppl as lfm
+from lfm_ppl.io.data_set import InputTable
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.inputs import to_dataset
 from lfm_ppl.results.predictions import noise_free_interval, summary
 from tests.inference import linear_motif as motif
 
@@ -199,15 +202,90 @@ def test_noise_of_rows_and_a_missing_keyword_are_named():
             lfm.Gaussian(jnp.reshape(level, (1,)), jnp.eye(1)))
         numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
-    times, keywords = np.arange(4.0), {"variances": np.full((4, 1, 1), 0.1)}
+    times, keywords = np.arange(4.0), {"variances": np.linspace(0.1, 0.4, 4)[:, None, None]}
     with pytest.warns(UserWarning, match="cannot be predicted"):
         result = lfm.fit(model, times, np.ones((4, 1)), sampler="map", samples=10, trajectory_draws=0, progress=False,
                          model_kwargs=keywords, at=[5.0])
     for given, error, message in ((None, TypeError, r"needs variances: pass model_kwargs=\{'variances': ...\}"),
-                                  (keywords, ValueError, "for each row"),
+                                  (keywords, ValueError, "differs between rows"),
                                   ({"variances": np.ones((2, 1, 1))}, ValueError, "2 matrices.* 4 times")):
         with pytest.raises(error, match=message):
             lfm.forecast(result, model, [5.0], model_kwargs=given, progress=False)
+
+
+def dosed(times, y=None, events=()):
+    rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.3))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: -rate * x, {}, lfm.GaussianObservation(systems.whole_state, jnp.array([0.01])),
+        lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))), state_names=("drug",), initial_time=0.0, events=events)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+
+def test_later_events_follow_those_of_the_fit():
+    rate = np.array([[[0.4], [0.6]]])
+    observed = xr.Dataset({"y": (("time", "output"), [[1.0], [0.5]])}, {"time": [1.0, 2.0], "output": ["drug"]})
+    result = arviz_data.build({
+        "posterior": xr.Dataset({"rate": (("chain", "draw"), rate[..., 0])}), "observed_data": observed,
+        "constant_data": to_dataset({"AMT": InputTable(np.array([0.0]), np.array([2.0]), "dose:drug")})})
+    both = 2 * np.exp(-5 * rate) + 3 * np.exp(-2 * rate)
+    doses = [lfm.Reset([2.5], "drug"), lfm.Dose([3.0], 3.0, "drug")]
+    for options, expected in (({"inputs": {"AMT": ([3.0], [3.0], "dose:drug")}}, both),
+                              ({"events": doses}, 3 * np.exp(-2 * rate))):
+        ahead = predictions(lfm.forecast(result, dosed, [5.0], progress=False, **options))
+        np.testing.assert_allclose(ahead["outputs"][..., 0], expected, rtol=1e-8)
+    for options, words in (({"events": [lfm.Dose([1.5], 3.0, "drug")]}, "a dose at time 1.5"),
+                           ({"inputs": {"AMT": ([0.0, 1.5], [2.0, 3.0])}}, "'AMT' .* at time 1.5"),
+                           ({"inputs": {"AMD": ([3.0], [3.0])}}, "'AMD'.*AMT")):
+        with pytest.raises(ValueError, match=words):
+            lfm.forecast(result, dosed, [5.0], progress=False, **options)
+
+
+def rowwise(times, y=None, R=None):
+    """A level that drifts, with noise given by row; a panel where the data have three dimensions."""
+    decay = numpyro.sample("decay", dist.LogNormal(0.0, 1.0))
+
+    def build(parameters):
+        return lfm.LatentForceModel(
+            lambda x, u, t: u - parameters["decay"] * x, {"f": lfm.Matern(1.0, 2.0)},
+            lfm.GaussianObservation(lambda x, u, t: x, parameters["R"]), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+
+    if np.ndim(R) == 3:
+        numpyro.sample("y", lfm.MarginalLikelihood(build({"decay": decay, "R": R}), times), obs=y)
+    else:
+        with numpyro.plate("series", 2):
+            numpyro.sample("y", lfm.panel(build, {"decay": jnp.repeat(decay, 2), "R": R}, times), obs=y)
+
+
+@pytest.mark.parametrize("lead", [(), pytest.param((2,), marks=pytest.mark.slow)], ids=["series", "panel"])
+def test_noise_of_rows_is_continued_or_constant(lead):
+    times, rng = np.arange(4.0), np.random.default_rng(0)
+    y, rows = rng.normal(size=(*lead, 4, 1)), rng.uniform(0.1, 1.0, (*lead, 4, 1, 1))
+    posterior = xr.Dataset({"decay": (("chain", "draw"), np.full((1, 3), 0.7))})
+    dims = ("series",) * len(lead)
+    result = arviz_data.build({"posterior": posterior, "observed_data": xr.Dataset(
+        {"y": ((*dims, "time", "output"), y)}, {"time": times, "output": ["a"]})})
+    later = rng.uniform(0.1, 1.0, (*lead, 2, 1, 1))
+
+    def expected(R, noise, series):
+        system = lfm.LatentForceModel(
+            lambda x, u, t: u - 0.7 * x, {"f": lfm.Matern(1.0, 2.0)},
+            lfm.GaussianObservation(lambda x, u, t: x, R[series]), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        smoothed = lfm.smooth(system, times, y[series], at=np.array([4.5, 7.0]))
+        return smoothed.mean[:, 0], np.sqrt(smoothed.covariance[:, 0, 0] + noise[series].ravel())
+
+    same = np.broadcast_to(rows[..., :1, :, :], rows.shape)
+    for R, inputs, noise in ((rows, {"R": later}, later), (same, None, same[..., :2, :, :])):
+        ahead = predictions(lfm.forecast(result, rowwise, [4.5, 7.0], inputs=inputs, model_kwargs={"R": R},
+                                         progress=False))
+        for series in np.ndindex(lead):
+            mean, sd = expected(R, noise, series)
+            np.testing.assert_allclose(ahead["y_mean"].values[(0, 0, *series)][:, 0], mean, atol=1e-8)
+            np.testing.assert_allclose(ahead["y_sd"].values[(0, 0, *series)][:, 0], sd, rtol=1e-8)
+    for inputs, at, words in ((None, [4.5, 7.0], "differs between rows"),
+                              ({"R": later[..., :1, :, :]}, [4.5, 7.0], "'R'"),
+                              ({"R": later}, [1.5, 7.0], "after the data")):
+        with pytest.raises(ValueError, match=words):
+            lfm.forecast(result, rowwise, at, inputs=inputs, model_kwargs={"R": rows}, progress=False)
 
 
 def test_a_panel_is_forecast_series_by_series():

@@ -9,7 +9,7 @@ import xarray as xr
 from matplotlib import pyplot
 
 import lfm_ppl as lfm
-from lfm_ppl.results import arviz_data
+from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.plots import plot_fit, plot_forces, plot_residuals, plot_states
 
@@ -83,6 +83,27 @@ def test_a_forecast_is_that_of_each_series(result, times):
         np.testing.assert_allclose(predicted["y_mean"][0, 0, :, 0], expected.mean[:, 0], atol=1e-9)
         sd = np.sqrt(expected.covariance[:, 0, 0] + 0.05)
         np.testing.assert_allclose(predicted["y_sd"][0, 0, :, 0], sd, rtol=1e-9)
+
+
+@pytest.mark.parametrize("times", [[6.0, 7.0], [1.5, 3.5, 9.0]])
+def test_a_forecast_of_a_selected_series_is_that_of_the_panel(result, times, tmp_path):
+    ahead = lfm.forecast(result, model, times, progress=False)
+    for series in ("Bo", 0):
+        view = lfm.select_series(result, series)
+        lfm.save(view, tmp_path / f"{series}.nc")
+        for stored in (view, lfm.load(tmp_path / f"{series}.nc")):
+            alone = lfm.forecast(stored, model, times, progress=False)
+            predicted, expected = (group(one, "predictions") for one in (alone, lfm.select_series(ahead, series)))
+            xr.testing.assert_allclose(predicted, expected)
+            assert predicted.attrs == expected.attrs
+        assert set(arviz_data.groups(alone)) == {*arviz_data.groups(view), "predictions"}
+        assert lfm.plot_fit(alone) is not None
+        assert lfm.score(alone, np.zeros((len(times), 1))).loc["all", "n"] == len(times)
+
+
+def test_the_likelihood_of_a_selected_series_is_that_of_the_panel(result):
+    with pytest.raises(ValueError, match="selected from"):
+        rebuilding.problem(lfm.select_series(result, "Bo"), model)
 
 
 def test_a_nonlinear_forecast_follows_the_dynamics(result):

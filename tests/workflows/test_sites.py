@@ -7,6 +7,7 @@ import numpyro
 import numpyro.distributions as dist
 import pandas as pd
 import pytest
+import xarray as xr
 
 import lfm_ppl as lfm
 from lfm_ppl.inference.posterior import trajectories
@@ -108,7 +109,7 @@ def test_a_selected_site_is_a_result_of_one_site(fitted, tmp_path):
         site = lfm.select_site(result, "b")
         assert set(arviz_data.groups(site)) == {"posterior", "log_prior", "observed_data", "log_likelihood",
                                                 "one_step_ahead", "trajectories", "posterior_predictive",
-                                                "predictions"}
+                                                "predictions", "other_sites"}
         assert arviz_data.group(site, "observed_data")["y"].dims == ("time", "output")
         assert arviz_data.group(site, "predictions")["y"].sizes["time"] == 2
         assert arviz_data.attributes(site)["likelihood"].startswith("exact")
@@ -125,6 +126,16 @@ def test_forecast_and_score_by_site(fitted):
     assert table.index.tolist() == ["level", "all"] and table.loc["all", "rmse"] < 0.3
     with pytest.raises(ValueError, match="'c'"):
         lfm.forecast(fitted, both, {"c": [6.0]}, progress=False)
+
+
+def test_a_forecast_of_a_selected_site_is_that_of_all_sites(fitted, tmp_path):
+    for name, times in (("a", [6.0, 7.0]), ("b", [2.2, 5.0])):
+        site = lfm.select_site(fitted, name)
+        lfm.save(site, tmp_path / f"{name}.nc")
+        alone = lfm.forecast(lfm.load(tmp_path / f"{name}.nc"), both, times, progress=False)
+        expected = lfm.select_site(lfm.forecast(fitted, both, {name: times}, progress=False), name)
+        xr.testing.assert_allclose(*(arviz_data.group(ahead, "predictions") for ahead in (alone, expected)))
+        assert lfm.score(alone, np.zeros((2, len(GAIN[name])))).loc["all", "n"] == 2 * len(GAIN[name])
 
 
 def test_paths_of_a_site_are_those_of_its_model_alone():
@@ -197,6 +208,10 @@ def test_known_inputs_reach_their_site():
     longer = lfm.Input(np.array([0.0, 2.0, 7.0]), np.array([0.5, 0.0, 1.0]))
     ahead = lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"a": {"heat": longer}}, progress=False)
     assert {"predictions_a", "predictions_constant_data_a"} <= set(arviz_data.groups(ahead))
+    alone = lfm.forecast(lfm.select_site(result, "a"), heated, [6.0, 7.0], inputs={"heat": longer}, progress=False)
+    assert arviz_data.has_group(alone, "predictions_constant_data")
+    xr.testing.assert_allclose(*(arviz_data.group(view, "predictions")["y"]
+                                 for view in (alone, lfm.select_site(ahead, "a"))))
     with pytest.raises(ValueError, match="inputs: unknown likelihood site 'heat'.*a, b"):
         lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"heat": longer}, progress=False)
 

@@ -1,7 +1,8 @@
 """Forecasts in the figures over time: the rows that are shown before them, and their curves.
 
 1. Next to a forecast that was made after the fit and is short beside the data, `recent_part` keeps the last rows only.
-2. Mean and bands continue the curves of the fit. Predictions at few times are bars: the curve between them is unknown.
+2. Mean and bands continue the curves of the fit. Predictions at few times are bars, joined by thin straight lines: the
+   curve between them is unknown.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from matplotlib.axes import Axes
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.arviz_data import group, has_group
 from lfm_ppl.results.inputs import FORECAST
+from lfm_ppl.results.inputs import GROUP as CONSTANT
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, INTERVAL, MEAN, interval, noise_free_interval
 from lfm_ppl.results.series import times_of
@@ -23,7 +25,9 @@ from lfm_ppl.results.series import times_of
 NOISE_FREE, PREDICTIVE = "#8FBFDE", "#D3E4F1"
 """Tints of blue: bands of noise-free outputs and of new data."""
 
-_CURVES = 12  # predictions from which they are drawn as curves
+CURVES = 12
+"""Number of times from which means and bands are drawn as curves."""
+
 _LONGEST_GAP = 3.0  # usual gaps between predictions that a curve crosses; nights without rows are longer
 _SMALLEST_SHARE, _FEWEST_ROWS = 0.2, 20
 """Share of the axis below which a forecast gets a third of it, and rows that are shown before it at least."""
@@ -82,8 +86,10 @@ def recent_part(result: Any) -> tuple[Any, str]:
     groups = {}
     for name in arviz_data.groups(result):
         groups[name] = group(result, name)
-        for clock in {"time", "at", "at_truth"} & set(groups[name].dims):
-            groups[name] = groups[name].isel({clock: groups[name][clock].values >= window[0]})
+        # Known inputs have times of their own, such as ``dose_time``, and resets.
+        clocks = [clock for clock in groups[name].dims if clock in ("time", "at", "at_truth") or
+                  name in (CONSTANT, FORECAST) and str(clock).endswith(("_time", "_reset"))]
+        groups[name] = groups[name].isel({clock: groups[name][clock].values >= window[0] for clock in clocks})
     remark = f"The last {(times >= window[0]).sum()} of {len(times)} rows of data and the forecast."
     return arviz_data.build(groups, arviz_data.attributes(result)), remark
 
@@ -113,7 +119,7 @@ def draw_outputs(axes: Axes, predicted: xr.Dataset, start: tuple[float, ...] = (
     time, lower, upper = new_data_band(predicted)
     low, high = noise_free_interval(predicted)[..., 0]
     mean = predicted[MEAN if MEAN in predicted else "outputs"].mean(["chain", "draw"]).values[:, 0]
-    _draw_curves(axes, (time, mean, lower, upper, low, high), start, style.BLUE,
+    draw_curves(axes, (time, mean, lower, upper, low, high), start, style.BLUE,
                  {"95%, new data": PREDICTIVE, "95%, noise-free": NOISE_FREE})
 
 
@@ -127,18 +133,28 @@ def draw_paths(axes: Axes, paths: xr.DataArray, start: tuple[float, ...], line: 
     if paths.sizes["time"]:
         flat = paths.transpose("chain", "draw", "time").values.reshape(-1, paths.sizes["time"])
         curves = (paths["time"].values, flat.mean(axis=0), *np.quantile(flat, INTERVAL, axis=0))
-        _draw_curves(axes, curves, start, line, {"95%": tint})
+        draw_curves(axes, curves, start, line, {"95%": tint})
 
 
-def _draw_curves(axes: Axes, curves: Sequence[np.ndarray], start: tuple[float, ...], line: str,
+def draw_curves(axes: Axes, curves: Sequence[np.ndarray], start: tuple[float, ...], line: str,
                  tints: dict[str, str]) -> None:
-    """Draw times, a mean and the ends of bands, the widest first; ``tints`` maps the labels of bands to colours."""
+    """Draw times, a mean and the ends of bands, the widest first; ``tints`` maps the labels of bands to colours.
+
+    At fewer than `CURVES` times the bands are bars, which thin lines join.
+    """
     count = len(curves[0])
-    if count >= _CURVES and start and start[0] < curves[0][0]:
-        curves = [np.append(first, curve) for first, curve in zip(start, curves, strict=True)]
+    joined = list(curves)
+    if start and start[0] < curves[0][0]:
+        joined = [np.append(first, curve) for first, curve in zip(start, curves, strict=True)]
+    if count >= CURVES:
+        curves = joined
+    elif len(joined[0]) > 1:
+        axes.plot(joined[0], joined[1], color=line, lw=0.7, zorder=2.9)
+        for curve in joined[2:]:
+            axes.plot(joined[0], curve, color=line, lw=0.5, ls=(0, (3, 2)), alpha=0.7, zorder=2.8)
     time, mean, *bounds = curves
     gaps = np.diff(time)
-    is_far = gaps > _LONGEST_GAP * np.median(gaps) if count >= _CURVES else np.ones(len(gaps), bool)
+    is_far = gaps > _LONGEST_GAP * np.median(gaps) if count >= CURVES else np.ones(len(gaps), bool)
     is_bar = np.append(True, is_far) & np.append(is_far, True)
     broken = [np.insert(curve, np.flatnonzero(is_far) + 1, np.nan) for curve in (time, mean, *bounds)]
     inches = axes.figure.bbox.width / axes.figure.dpi

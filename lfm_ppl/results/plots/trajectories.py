@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lfm_ppl.results.arviz_data import group, has_group, refuse_several_sites
-from lfm_ppl.results.inputs import time_origin, time_unit
+from lfm_ppl.results.inputs import FORECAST, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import forecasts, style
 from lfm_ppl.results.predictions import INTERVAL, PERIODS, REGIMES, SHOWN_PERIODS, quantiles, repeats_often
 from lfm_ppl.results.scalars import unit_of
@@ -38,15 +38,15 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any =
              width: str | float = "column") -> Figure:
     """Draw the data of each output with the posterior of what was measured, and forecasts of it.
 
-    The inner band holds 95% of the noise-free output, the outer one 95% of new measurements. Where the
-    result has predictions, both go on after the last observation, which a dotted line marks, and the outer
-    band is theirs; forecasts at fewer than 40 times are drawn as bars. Of a forecast that was made after the fit and
-    would fill less than a fifth of the axis, the figure shows the last rows only. Bands follow the summaries that the
+    The inner band holds 95% of the noise-free output, the outer one 95% of new measurements. Where the result has
+    predictions, both go on after the last observation, which a dotted line marks, and the outer band is theirs; at
+    fewer than 12 times they are drawn as bars, which lines join. Of a forecast that was made after the fit and would
+    fill less than a fifth of the axis, the figure shows the last rows only. Bands follow the summaries that the
     trajectories hold; where they hold draws alone, they are quantiles of these, and the outer one ends with the data:
     it is exact at the measurement times, and between them the inner one widened by the difference of the two,
-    interpolated linearly; of counts it is a step at each time. Replicates are pooled. Of simulated data the noise-free
-    truth is drawn, too. A band shows the model as it is: under Gaussian noise new data of a positive quantity may be
-    negative; observe its logarithm, or use an observation family of positive values.
+    interpolated linearly; of counts it is a step at each time. Replicates are pooled. Of simulated data the
+    noise-free truth is drawn, too. A band shows the model as it is: under Gaussian noise new data of a positive
+    quantity may be negative; observe its logarithm, or use an observation family of positive values.
 
     Args:
         result: with the groups observed_data and trajectories, posterior_predictive for the outer band, predictions for
@@ -58,7 +58,7 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any =
 
     Returns:
         A figure with one panel per output, and for each series of a panel. Ticks at the top mark the times of missing
-        values.
+        values, triangles at the bottom those of doses in the data.
 
     Raises:
         ValueError: a group is missing, or an output is unknown.
@@ -84,8 +84,9 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any =
         _draw_output(axes, part, name)
         forecasts.mark_last_observation(axes, part)
         _draw_truth(axes, part, "output", name)
-        _draw_data(axes, group(part, "observed_data")["y"].sel(output=name))
+        _draw_data(axes, part, name)
         forecasts.draw_held_out(axes, part, name)
+        _draw_events(axes, part)
         style.label_values(axes, name, unit_of(observed, name), title)
     finish(figure, panels, result, f"{remark} {note}")
     return figure
@@ -249,8 +250,7 @@ def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, series: 
         band = np.array(_band(part, kind, name))
         first, last = windows.get(name, (-np.inf, np.inf))
         time, mean, low, high = band[:, band[0] >= first]
-        axes.plot(time, mean, color=colours[0], zorder=2, label="posterior mean")
-        axes.fill_between(time, low, high, color=colours[1], lw=0, zorder=1, label="95%")
+        _draw_band(axes, (time, mean, low, high), *colours, "95%")
         if paths is not None:
             later = paths.sel({kind: name, "time": (paths["time"] > time[-1]) & (paths["time"] <= last)})
             forecasts.draw_paths(axes, later, (time[-1], mean[-1], low[-1], high[-1]), *colours)
@@ -337,11 +337,19 @@ def _draw_output(axes: Axes, result: Any, name: str) -> None:
     if predicted is not None and is_covered and _summary(result, "outputs") is None:
         return forecasts.draw_outputs(axes, predicted)
     outer = _draw_new_data(axes, result, name, predicted if is_covered else None, (time, low, high))
-    axes.fill_between(time, low, high, color=forecasts.NOISE_FREE, lw=0, zorder=2, label="95%, noise-free")
-    axes.plot(time, mean, color=style.BLUE, zorder=3, label="posterior mean")
+    _draw_band(axes, (time, mean, low, high), style.BLUE, forecasts.NOISE_FREE, "95%, noise-free")
     if predicted is not None and not is_covered:
         later = predicted.isel(time=predicted["time"].values > time[-1])
         forecasts.draw_outputs(axes, later, (time[-1], mean[-1], *outer, low[-1], high[-1]))
+
+
+def _draw_band(axes: Axes, curves: Sequence[np.ndarray], line: str, tint: str, label: str) -> None:
+    """Draw mean and band of times, mean and ends; at few times as bars that lines join."""
+    time, mean, low, high = curves
+    if len(time) < forecasts.CURVES:
+        return forecasts.draw_curves(axes, curves, (), line, {label: tint})
+    axes.fill_between(time, low, high, color=tint, lw=0, zorder=2, label=label)
+    axes.plot(time, mean, color=line, zorder=3, label="posterior mean")
 
 
 def _draw_new_data(axes: Axes, result: Any, name: str, predicted: xr.Dataset | None,
@@ -359,6 +367,8 @@ def _draw_new_data(axes: Axes, result: Any, name: str, predicted: xr.Dataset | N
     else:
         return inner[1][-1], inner[2][-1]
     time, low, high = band
+    if len(time) < forecasts.CURVES and step is None:
+        axes.vlines(time, low, high, color=forecasts.PREDICTIVE, lw=7.0, zorder=0.9)
     axes.fill_between(time, low, high, color=forecasts.PREDICTIVE, lw=0, zorder=1, step=step, label="95%, new data")
     return low[-1], high[-1]
 
@@ -400,14 +410,44 @@ def _summary(result: Any, name: str) -> xr.DataArray | None:
     return None if summary is None else summary.transpose("statistic", "at", ...)
 
 
-def _draw_data(axes: Axes, data: xr.DataArray) -> None:
-    """Draw measurements, many of them small, and ticks at the top edge where one is missing."""
-    times, values, is_missing = data["time"].values, data.values, np.isnan(data.values)
+def _draw_data(axes: Axes, result: Any, name: str) -> None:
+    """Draw measurements of an output, many of them small, and ticks at the top edge where one is missing.
+
+    Rows of a data file that hold a dose or a reset and no measurement are not missing.
+    """
+    observed = group(result, "observed_data")["y"]
+    times, values = observed["time"].values, observed.sel(output=name).values
+    event_times = [np.append(table.times, [] if table.resets is None else table.resets)
+                   for table in inputs_of(result).values() if table.is_dose]
+    is_event = np.isin(times, np.concatenate([np.zeros(0), *event_times])) & observed.isnull().all("output").values
+    is_missing = np.isnan(values) & ~is_event
     look: dict[str, Any] = {"color": style.BLACK, "ms": 2.6, "mec": "white", "mew": 0.3, "zorder": 4}
     if len(times) > _MANY:
         look = {"color": style.GREY, "ms": 1.5, "mew": 0, "zorder": 2.5}
-    axes.plot(times[~is_missing], values[~is_missing], ls="", marker="o", rasterized=len(times) > 5000, label="data",
+    is_measured = ~np.isnan(values)
+    axes.plot(times[is_measured], values[is_measured], ls="", marker="o", rasterized=len(times) > 5000, label="data",
               **look)
     if is_missing.any():
         axes.plot(times[is_missing], np.full(is_missing.sum(), 0.98), transform=axes.get_xaxis_transform(), ls="",
                   color=style.GREY, marker="|", ms=4, mew=0.8, zorder=5, label="missing")
+
+
+def _draw_events(axes: Axes, result: Any) -> None:
+    """Draw marks at the bottom edge at the times of doses and resets, as far as the axes are in use."""
+    tables = [table for table in {**inputs_of(result), **inputs_of(result, FORECAST)}.values() if table.is_dose]
+    end = axes.dataLim.intervalx[1]
+    height: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "zorder": 5}
+    marks: dict[str, Any] = {"ls": "", "ms": 3.5, "mew": 0.0}
+    doses, durations = (np.concatenate([np.zeros(0), *(array for array in arrays)]) for arrays in zip(
+        *((table.times, table.durations_of_all) for table in tables), strict=True)) if tables else (np.zeros(0),) * 2
+    resets = np.concatenate([np.zeros(0), *(table.resets for table in tables if table.resets is not None)])
+    is_infusion = (durations > 0) & (doses <= end)
+    if is_infusion.any():
+        ends = np.minimum(doses + durations, end)[is_infusion]
+        axes.hlines(np.full(len(ends), 0.03), doses[is_infusion], ends, color=style.PURPLE, lw=1.5, label="infusion",
+                    **height)
+    for times, marker, label in ((doses[(durations == 0) & (doses <= end)], "^", "dose"),
+                                 (resets[resets <= end], "v", "reset")):
+        if len(times):
+            axes.plot(times, np.full(len(times), 0.03), marker=marker, color=style.PURPLE, label=label, **marks,
+                      **height)
