@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Collection, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -19,6 +19,59 @@ from lfm_ppl.io.table import is_table
 from lfm_ppl.model.events import Event
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.utils import calendar_time, checks, date_warnings
+
+
+class SiteData(NamedTuple):
+    """The data of a likelihood site.
+
+    Attributes:
+        on_clock: the data with times in the unit of the model; None where times and y were passed themselves.
+        unit: the unit of time of the data that were passed; None where it is unknown.
+        labelled_y: the observations where they were passed themselves, whose labels may name dimensions.
+    """
+
+    on_clock: Data | None
+    unit: str | None
+    labelled_y: Any
+
+    @classmethod
+    def of(cls, given: Any, on_clock: Any) -> SiteData:
+        """Return the data of a site from what was passed, `Data` or (times, y), and the same on the model's clock."""
+        on_clock = on_clock if isinstance(on_clock, Data) else None
+        if isinstance(given, Data):
+            return cls(on_clock, given.units.get("time"), None)
+        return cls(on_clock, None, given[1])
+
+
+class BoundData(NamedTuple):
+    """A model that is bound to its data.
+
+    Attributes:
+        bound: the bound model.
+        series: the data by likelihood site, also of one site.
+        clock: the calendar time of t = 0 (None where times are plain numbers) with the unit of time.
+        model_kwargs: keyword arguments of the model; of one site with the known inputs of its data.
+    """
+
+    bound: BoundModel
+    series: dict[str, SiteData]
+    clock: tuple[str | None, str]
+    model_kwargs: Mapping[str, Any] | None
+
+
+def bind_data(numpyro_model: Callable, times: Any, y: Any, model_kwargs: Mapping[str, Any] | None) -> BoundData:
+    """Bind a model to data with dates or units, of one likelihood site or by site; arguments as `lfm_ppl.fit`."""
+    site_data = data_by_site(times, y)
+    if site_data is not None:
+        bound, on_clock, clock = bind_sites(numpyro_model, site_data, model_kwargs)
+        return BoundData(bound, {name: SiteData.of(value, on_clock[name]) for name, value in site_data.items()}, clock,
+                         model_kwargs)
+    table = as_data(times) if y is None else None
+    pair = (times, y) if table is None else (table.times, table.y)
+    bound, data, clock = bind_dates(numpyro_model, pair[0], pair[1], table, model_kwargs)
+    keywords = model_kwargs if data is None else model_keywords(data.inputs, model_kwargs)
+    return BoundData(bound, {bound.site.name: SiteData.of(times if isinstance(times, Data) else pair, data)}, clock,
+                     keywords)
 
 
 def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,

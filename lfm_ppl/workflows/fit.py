@@ -37,8 +37,6 @@ from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.inference.start_failure import start_failure
-from lfm_ppl.io.data import as_data
-from lfm_ppl.io.data_set import Data, model_keywords
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
@@ -48,11 +46,10 @@ from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import waiting
 from lfm_ppl.utils.types import Result, Times
 from lfm_ppl.workflows.data_binding import (
-    bind_dates,
-    bind_sites,
+    SiteData,
+    bind_data,
     check_requested_times,
     coords_of_site,
-    data_by_site,
     of_site,
     warn_of_missing_predictions,
 )
@@ -240,23 +237,14 @@ def fit(
         raise ValueError("resume continues a run that is stored in a folder; name the folder, checkpoint=...")
     if checkpoint is not None:
         checkpoints.check_folder(checkpoint, resume, overwrite)
-    site_data = data_by_site(times, y)
-    if site_data is None:
-        table = as_data(times) if y is None else None
-        pair = (times, y) if table is None else (table.times, table.y)
-        bound, data, clock = bind_dates(numpyro_model, pair[0], pair[1], table, model_kwargs)
-        if data is not None:
-            model_kwargs = model_keywords(data.inputs, model_kwargs)
-        value = times if isinstance(times, Data) else pair
-        sites = {bound.site.name: _site_problem(bound, value, data, clock, at, truth, dims, coords)}
-    elif sampler == "pmmh":
+    bound, series, clock, model_kwargs = bind_data(numpyro_model, times, y, model_kwargs)
+    names = list(series) if bound.is_by_site else []
+    if names and sampler == "pmmh":
         raise ValueError("sampler 'pmmh' takes a model with one likelihood site, and there are data of "
-                         f"{', '.join(site_data)}; take 'nuts' or 'ram'.")
-    else:
-        bound, on_clock, clock = bind_sites(numpyro_model, site_data, model_kwargs)
-        sites = {name: _site_problem(bound.site_models[name], value, on_clock[name], clock,
-                                     of_site("at", at, name, site_data), of_site("truth", truth, name, site_data), dims,
-                                     coords_of_site(coords, name, site_data)) for name, value in site_data.items()}
+                         f"{', '.join(names)}; take 'nuts' or 'ram'.")
+    sites = {name: _site_problem(bound.site_models[name], data, clock, of_site("at", at, name, names),
+                                 of_site("truth", truth, name, names), dims, coords_of_site(coords, name, names))
+             for name, data in series.items()}
     digest = None if checkpoint is None else model_digest(bound)
     bound = bound.fix(fixed)
     sites = {name: replace(sites[name], bound=site_model, description={
@@ -312,12 +300,11 @@ def fit(
     return result
 
 
-def _site_problem(bound: BoundModel, site_data: Data | tuple, data: Any, clock: tuple[str | None, str], at: Any,
+def _site_problem(bound: BoundModel, site_data: SiteData, clock: tuple[str | None, str], at: Any,
                   truth: Mapping[str, Any] | None, dims: Mapping[str, Sequence[str]] | None,
                   coords: Mapping[str, Sequence[Any]] | None) -> SiteProblem:
-    """Check the arguments of `fit` on one likelihood site; ``data`` are ``site_data`` with times on the clock."""
-    unit = site_data.units.get("time") if isinstance(site_data, Data) else None
-    data = data if isinstance(data, Data) else None
+    """Check the arguments of `fit` on one likelihood site."""
+    data, unit = site_data.on_clock, site_data.unit
     if clock[0] is None and data is not None:  # each site may have a unit of its own
         clock = None, data.units.get("time", "")
     if calendar_time.holds_dates(at):
@@ -330,7 +317,7 @@ def _site_problem(bound: BoundModel, site_data: Data | tuple, data: Any, clock: 
         warn_of_missing_predictions(bound, at)
     if data is not None:
         coords = {"output": data.outputs, **({SERIES: data.series} if data.series else {}), **(coords or {})}
-    labels = Labels.of(bound, dims, coords, None if isinstance(site_data, Data) else site_data[1])
+    labels = Labels.of(bound, dims, coords, site_data.labelled_y)
     truth = data.truth if truth is None and data is not None else truth
     return SiteProblem(bound, labels, at, data, clock, checked_truth(bound, truth, labels))
 
