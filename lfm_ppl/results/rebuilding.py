@@ -142,9 +142,9 @@ def _check_function(name: str, stored: InputTable, table: InputTable, first: flo
     if differing.size:
         row = differing[0]
         time, end = calendar_time.named(float(knots[row])), calendar_time.named(last)
-        raise ValueError(f"the known input {name!r} of the forecast is {later[row]:g} at time {time}, where that of the "
-                         f"fit is {earlier[row]:g}. Until the last observation, at time {end}, they must be the same: "
-                         "give later rows only, which continue those of the fit, or fit again.")
+        raise ValueError(f"the known input {name!r} of the forecast is {later[row]:g} at time {time}, where that of "
+                         f"the fit is {earlier[row]:g}. Until the last observation, at time {end}, they must be the "
+                         "same: give later rows only, which continue those of the fit, or fit again.")
 
 
 def _check_doses(name: str, stored: InputTable, table: InputTable, first: float, last: float) -> None:
