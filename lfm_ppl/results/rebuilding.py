@@ -141,9 +141,10 @@ def _check_function(name: str, stored: InputTable, table: InputTable, first: flo
     differing = np.flatnonzero(np.abs(earlier - later) > rounding)
     if differing.size:
         row = differing[0]
-        raise ValueError(f"the known input {name!r} of the forecast is {later[row]:g} at time {knots[row]:g}, where "
-                         f"that of the fit is {earlier[row]:g}. Until the last observation, at time {last:g}, they "
-                         "must be the same: give later rows only, which continue those of the fit, or fit again.")
+        time, end = calendar_time.named(float(knots[row])), calendar_time.named(last)
+        raise ValueError(f"the known input {name!r} of the forecast is {later[row]:g} at time {time}, where that of "
+                         f"the fit is {earlier[row]:g}. Until the last observation, at time {end}, they must be the "
+                         "same: give later rows only, which continue those of the fit, or fit again.")
 
 
 def _check_doses(name: str, stored: InputTable, table: InputTable, first: float, last: float) -> None:
@@ -167,9 +168,10 @@ def _check_doses(name: str, stored: InputTable, table: InputTable, first: float,
             continue
         given, fitted = ("none" if np.isnan(amount) else state if state == "a reset" else f"{amount:g} to {state}"
                          for amount in amounts)
-        raise ValueError(f"the doses {name!r} of the forecast at time {time:g} are {given}, where those of the fit are "
-                         f"{fitted}. Before the last observation, at time {last:g}, they must be the same: give later "
-                         "doses only, which continue those of the fit, or fit again.")
+        raise ValueError(f"the doses {name!r} of the forecast at time {calendar_time.named(time)} are {given}, where "
+                         f"those of the fit are {fitted}. Before the last observation, at time "
+                         f"{calendar_time.named(last)}, they must be the same: give later doses only, which continue "
+                         "those of the fit, or fit again.")
 
 
 def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None,

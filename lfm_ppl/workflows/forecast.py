@@ -139,7 +139,8 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
     keywords = rebuilding.keywords(result, later if sites else later[""], model_kwargs)
     for name, view in views.items():
         if site_events := of_site("events", events, name, sites):
-            _check_events(view, site_events, numpyro_model)
+            with calendar_time.in_messages(*clocks[name]):
+                _check_events(view, site_events, numpyro_model)
             earlier = keywords.get("events", {} if sites else ())
             keywords["events"] = ({**earlier, name: [*earlier.get(name, ()), *site_events]} if sites
                                   else [*earlier, *site_events])
@@ -194,8 +195,9 @@ def _check_events(result: Result, events: Sequence[Event], numpyro_model: Callab
         if not isinstance(event, Event):
             raise TypeError(f"events must be lfm.Dose, lfm.Infusion or lfm.Reset, got {type(event).__name__}.")
         if np.min(event.event_times, initial=np.inf) < last:
-            raise ValueError(f"events: {event.label} at time {np.min(event.event_times):g} lies before the last "
-                             f"observation, at time {last:g}; events of the forecast follow those of the fit.")
+            time, end = calendar_time.named(float(np.min(event.event_times))), calendar_time.named(last)
+            raise ValueError(f"events: {event.label} at time {time} lies before the last observation, at time {end}; "
+                             "events of the forecast follow those of the fit.")
 
 
 def _arguments(numpyro_model: Callable) -> dict[str, inspect.Parameter]:

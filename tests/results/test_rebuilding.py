@@ -98,3 +98,5 @@ def test_later_data_are_converted_to_the_clock_of_the_fit():
     dated = result({"heater": HEATER}, origin="2026-01-01T00:00:00")
     dates = np.array(["2026-01-01T06", "2026-01-01T12"], "datetime64[s]")
     assert continued_tables(dated, {"heater": (dates, [1.0, 2.0])})["heater"].times.tolist() == [0.0, 2.0, 6.0, 12.0]
+    with pytest.raises(ValueError, match="at time 2026-01-01T03:00.* at time 2026-01-01T05:00"):
+        continued_tables(dated, {"heater": (np.array(["2026-01-01T03", "2026-01-01T12"], "datetime64[s]"), [1.0, 2.0])})
