@@ -1,7 +1,9 @@
 """Results of models with several likelihood sites: their layout, and the view of one site as a result of one site.
 
 1. Parameters, statistics of the sampler and the accuracy check are common to all sites.
-2. Groups of observations hold one variable for each site, with dimensions of its own: ``y`` over ``y_time``.
+2. Groups of observed entries hold one variable for each site, with a dimension of its own: ``y`` over
+   ``y_observation``. There the log likelihood has no coordinates, which ArviZ cannot stack across variables; they are
+   those of the observed data.
 3. Every other group belongs to one site and has its name: ``trajectories_y``.
 """
 
@@ -21,8 +23,8 @@ _COMMON = ("posterior", "sample_stats", "log_prior", "accuracy")
 _OBSERVED = ("observed_data", "log_likelihood", "posterior_predictive")
 """Groups with one variable for each site."""
 
-_OF_SITE = ("one_step_ahead", "trajectories", "predictions", "truth", "constant_data", "predictions_constant_data",
-            "held_out_data")
+_OF_SITE = ("data", "one_step_ahead", "trajectories", "predictions", "truth", "constant_data",
+            "predictions_constant_data", "held_out_data")
 """Groups that each site has for itself."""
 
 _VARIABLE = "y"
@@ -38,9 +40,10 @@ def merge_sites(sites: Mapping[str, Mapping[str, xr.Dataset]]) -> dict[str, xr.D
             if group in _COMMON:
                 merged.setdefault(group, dataset)
             elif group in _OBSERVED:
-                labels = (*dataset.dims, *({"times"} & set(dataset.variables)))
-                names = {label: f"{stored}_{label}" for label in labels if label not in ("chain", "draw")}
-                names[name] = stored
+                if group == "log_likelihood":
+                    dataset = dataset.drop_vars([label for label in dataset.coords if label not in ("chain", "draw")])
+                labels = {*dataset.dims, *dataset.coords} - {"chain", "draw"}
+                names = {label: f"{stored}_{label}" for label in labels} | {name: stored}
                 merged[group] = merged.get(group, xr.Dataset()).merge(dataset.rename(names))
             else:
                 merged[f"{group}_{stored}"] = dataset
@@ -65,14 +68,14 @@ def select_site(result: Result, name: str) -> Result:
 
     Example:
         >>> import numpy as np, lfm_ppl as lfm
-        >>> groups = {name: {"observed_data": xr.Dataset({name: (("time", "output"), np.zeros((count, 1)))})}
+        >>> groups = {name: {"observed_data": xr.Dataset({name: ("observation", np.zeros(count))})}
         ...           for name, count in (("short", 2), ("long", 5))}
         >>> merged = merge_sites(groups)["observed_data"]
         >>> merged["long"].dims
-        ('long_time', 'long_output')
+        ('long_observation',)
         >>> result = arviz_data.build({"observed_data": merged}, {"likelihood_sites": '{"short": {}, "long": {}}'})
         >>> lfm.select_site(result, "long")["observed_data"]["y"].dims
-        ('time', 'output')
+        ('observation',)
     """
     settings = arviz_data.sites_of(result)
     if name not in settings:
@@ -86,12 +89,14 @@ def select_site(result: Result, name: str) -> Result:
         if group in _COMMON:
             groups[group] = dataset
         elif group in _OBSERVED and stored in dataset:
-            part = dataset[[variable for variable in (stored, f"{stored}_times") if variable in dataset]]
+            part = dataset[[stored]]
             names = {label: str(label).removeprefix(f"{stored}_") for label in (*part.variables, *part.dims)}
             groups[group] = part.rename(names | {stored: _VARIABLE})
         elif group != kind and kind in _OF_SITE:
             groups[kind] = dataset.rename({stored: _VARIABLE}) if stored in dataset else dataset
             if "observed" in dataset.attrs:
                 groups[kind] = groups[kind].assign_attrs(observed=_VARIABLE)
+    if {"log_likelihood", "observed_data"} <= set(groups):
+        groups["log_likelihood"] = groups["log_likelihood"].assign_coords(groups["observed_data"].coords)
     attributes = {key: value for key, value in arviz_data.attributes(result).items() if key != arviz_data.LIKELIHOODS}
     return arviz_data.build(groups, attributes | settings[name])
