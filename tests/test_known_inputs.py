@@ -74,7 +74,7 @@ def test_the_command_line_maps_columns_to_the_model_s_names_and_unit(tmp_path, m
     assert {name: table.interpolation for name, table in inputs_of(result).items()} == {
         "power": "previous", "weather": "linear"}
     assert inputs_of(result)["power"].values.tolist() == [0.0, 2.0, 2.0, 0.0]
-    observed = arviz_data.group(result, "observed_data")
+    observed = arviz_data.group(result, "data")
     np.testing.assert_allclose(observed["time"], [6.0, 6.5, 7.0, 8.0], rtol=1e-15)
     assert observed["output"].values.tolist() == ["T"]
     room = pathlib.Path(__file__).parent.parent / "docs" / "examples" / "room.py"
@@ -139,7 +139,7 @@ def test_a_fit_takes_a_table_and_its_result_remembers_inputs_and_dates(tmp_path)
     np.testing.assert_array_equal(inputs_of(again)["outside"].values, data.inputs["outside"].values)
     assert inputs_of(again)["outside"].interpolation == "linear"
     assert arviz_data.attributes(again)["time_origin"] == "2026-01-05T00:00:00"
-    assert arviz_data.group(again, "observed_data")["time"].attrs["units"] == "h"
+    assert arviz_data.group(again, "data")["time"].attrs["units"] == "h"
     # The model is bound again with the inputs that the result holds, and gives the densities that it records.
     whole = rebuilding.problem(again, heated)
     assert np.isfinite(whole.bound.log_density(np.zeros(whole.bound.size)))

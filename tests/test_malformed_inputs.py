@@ -141,7 +141,7 @@ def result():
     noise = np.exp(0.3 * np.random.default_rng(0).normal(size=(2, 50)) - 0.5)
     return arviz_data.build({
         "posterior": xr.Dataset({"noise": (("chain", "draw"), noise)}),
-        "observed_data": xr.Dataset({"y": (("time", "output"), Y)}, {"time": T, "output": ["x"]})}, {
+        "data": xr.Dataset({"y": (("time", "output"), Y)}, {"time": T, "output": ["x"]})}, {
         "model": "model", "model_file": "model.py", "rule": "Cubature()", "steps": 1, "iterations": 3,
         "sampler": "nuts", "chains": 2, "warmup": 50, "samples": 50, "seed": 0, "fixed": "{}", "options": "{}",
         "settings": '{"rule": null, "steps": null, "max_step": null, "iterations": null, "tolerance": null}'})

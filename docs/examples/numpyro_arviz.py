@@ -51,8 +51,13 @@ print(az.summary(smooth, var_names=["decay", "lengthscale"]))
 # --8<-- [end:mcmc]
 
 # --8<-- [start:compare]
-print(az.loo(smooth))  # from 21 leave-one-out conditionals, one a row
+print(az.loo(smooth))  # from 21 leave-one-out conditionals
 print(az.compare({"rough": rough, "smooth": smooth}))
+if hasattr(az, "psense_summary"):  # ArviZ 1.x
+    print(az.loo_pit(smooth)["y"])
+    print(az.psense_summary(smooth))  # sensitivity to the prior
+    az.plot_ppc_dist(smooth)
+    az.plot_ppc_pit(smooth)
 # --8<-- [end:compare]
 
 # --8<-- [start:svi]

@@ -85,7 +85,7 @@ def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) 
     # The scores of an observation family need the model.
     is_gaussian = MEAN in arviz_data.group(forecast, GROUP)
     scores = lfm_ppl.score(forecast, held_out, **({} if is_gaussian else {"numpyro_model": task.model, **keywords}))
-    group = held_out_data(held_out.times, held_out.y, arviz_data.group(forecast, "observed_data"))
+    group = held_out_data(held_out.times, held_out.y, arviz_data.group(forecast, "data"))
     return arviz_data.add_group(forecast, HELD_OUT, group), scores
 
 

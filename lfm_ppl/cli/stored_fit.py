@@ -54,7 +54,7 @@ def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit
         times, y = rebuilding.observations(posterior)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    group = arviz_data.group(posterior, "observed_data")
+    group = arviz_data.group(posterior, "data")
     outputs = tuple(str(name) for name in group["output"].values)
     if model.outputs is not None and model.outputs != outputs:
         raise ValueError(f"{path} is of the outputs {', '.join(outputs)}; {model.path} has "

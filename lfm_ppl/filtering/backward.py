@@ -56,6 +56,8 @@ class SmootherTrace(NamedTuple):
     Attributes:
         moments: smoothed, at the N + 1 nodes.
         leave_one_out: (N,), log p(y_k | all other observations), zero in intervals without an observation.
+        entry_leave_one_out: (N, D), log p of each entry of y_k given all other entries of all observations; without a
+            meaning where the entry is missing, and (N,) of a pass without leave-one-out terms.
         adjoint: r (N, n) and Lambda (N, n, n) at the interval's end, its observation and all later ones included: the
             smoothed mean there is m_p + P_p r, the covariance P_p - P_p Lambda P_p.
         predictor: (N, ...), of a pass with sites, which has no leave-one-out terms; None of any other.
@@ -63,6 +65,7 @@ class SmootherTrace(NamedTuple):
 
     moments: Moments
     leave_one_out: jax.Array
+    entry_leave_one_out: jax.Array
     adjoint: tuple[jax.Array, jax.Array]
     predictor: SmoothedPredictor | None = None
 
@@ -91,7 +94,7 @@ def backward(problem: FilterProblem, trace: FilterTrace, adjoint_only: bool = Fa
         later, r, adjoint = carry
         filtered, interval, skip = row
         update, predicted = interval.update, interval.predicted
-        left_out, predictor = jnp.zeros(()), None
+        left_out, predictor = (jnp.zeros(()), jnp.zeros(())), None
         if update.site_terms is not None:
             predictor = _smoothed_predictor(update, predicted, r, adjoint)
         elif not adjoint_only:
@@ -113,7 +116,8 @@ def backward(problem: FilterProblem, trace: FilterTrace, adjoint_only: bool = Fa
     (first, _, _), (smoothed_ends, left_out, adjoint, predictor) = jax.lax.scan(
         jax.checkpoint(step, prevent_cse=False), carry, rows, reverse=True)
     moments = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, smoothed_ends)
-    return SmootherTrace(moments, left_out, adjoint, predictor)
+    rows_left_out, entries_left_out = left_out
+    return SmootherTrace(moments, rows_left_out, entries_left_out, adjoint, predictor)
 
 
 def _smoothed_predictor(update: Update, predicted: Moments, r: jax.Array, adjoint: jax.Array) -> SmoothedPredictor:
@@ -156,12 +160,21 @@ def _add_observation(update: Update, r: jax.Array, adjoint: jax.Array) -> tuple[
             congruence(update.jacobian.T, inverse) + congruence(i_kh.T, adjoint))
 
 
-def _leave_one_out(update: Update, r: jax.Array, adjoint: jax.Array) -> jax.Array:
-    """Return the log density of an interval's observation given all others."""
+def _leave_one_out(update: Update, r: jax.Array, adjoint: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the log density of an interval's observation given all others, and that of each entry (D,) given the rest.
+
+    With u and C of de Jong (1989), y - C^-1 u is the mean of y given all other observations and C^-1 its covariance, so
+    that y_d given all other entries has the mean y_d - u_d / C_dd and the variance 1 / C_dd.
+    """
     inverse, white = _whitened(update)
     u = white - matvec(update.gain.T, r)
     precision = inverse + congruence(update.gain.T, adjoint)
     factor = cholesky(precision)
     # A missing entry has unit precision and u = 0, and so contributes nothing.
     density: Any = log_density(solve_lower(factor.chol, u), factor.chol, update.present)
-    return density + 2.0 * jnp.log(diagonal(factor.chol)).sum()  # C is a precision
+    row = density + 2.0 * jnp.log(diagonal(factor.chol)).sum()  # C is a precision
+    precisions = diagonal(precision)
+    is_positive = precisions > 0
+    safe = jnp.where(is_positive, precisions, 1.0)
+    entries = 0.5 * (jnp.log(safe) - u**2 / safe - np.log(2.0 * np.pi))
+    return row, jnp.where(is_positive, entries, -jnp.inf)

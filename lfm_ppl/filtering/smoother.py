@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from lfm_ppl.filtering.arguments import as_rule, check_iterations, check_observations, warn_single_precision
 from lfm_ppl.filtering.backward import backward
 from lfm_ppl.filtering.breakdown import warn_of_breakdown, warn_of_iterations
-from lfm_ppl.filtering.ep.evidence import evidence, leave_one_out
+from lfm_ppl.filtering.ep.evidence import entry_leave_one_out, evidence, leave_one_out
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter, quantile_residuals
 from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
@@ -75,6 +75,8 @@ class SmootherResult(eqx.Module):
         input_mean, input_covariance: (K, M + R), (K, M + R, M + R) of w = (x, u).
         log_likelihood: (T,), log p(y_k | y_1:k-1).
         leave_one_out: (T,), log p(y_k | y_-k).
+        entry_leave_one_out: (T, D), log p of each entry of y given all other entries; without a meaning where the entry
+            is missing.
         whitened_innovation: (T, D), innovations whitened by their Cholesky factor, or randomised quantile residuals
             of an observation family, NaN where missing.
         change: largest change of a smoothed mean in the last iteration, in smoothed standard deviations; NaN
@@ -82,7 +84,8 @@ class SmootherResult(eqx.Module):
         log_likelihood_change: change of the sum of ``log_likelihood`` in the last iteration; NaN with fewer than two.
         converged: whether the sites of an observation family have converged; true where there are none. Where they
             have not, a model that is not linear is smoothed with the sites of assumed density filtering, and
-            ``leave_one_out`` is ``log_likelihood``; in a linear model both are -inf.
+            ``leave_one_out`` is ``log_likelihood``, divided equally among the entries of a row; in a linear model all
+            are -inf.
     """
 
     times: jax.Array
@@ -92,6 +95,7 @@ class SmootherResult(eqx.Module):
     input_covariance: jax.Array
     log_likelihood: jax.Array
     leave_one_out: jax.Array
+    entry_leave_one_out: jax.Array
     whitened_innovation: jax.Array
     change: jax.Array
     log_likelihood_change: jax.Array
@@ -259,13 +263,14 @@ def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int,
         points, change, previous = posterior_linearisation(problem, updater, iterations, damping)
     trace = forward(problem, updater, about=points, record=Record.SMOOTHER)
     smoothed = backward(problem, trace)
-    at_data, left_out = at_intervals((trace._replace(initial=None), smoothed.leave_one_out), problem.grid.observed)
+    at_data, left_out, entries = at_intervals(
+        (trace._replace(initial=None), smoothed.leave_one_out, smoothed.entry_leave_one_out), problem.grid.observed)
     residual = whitened_innovations(at_data, y)
     log_likelihood = jnp.where(jnp.isnan(at_data.log_likelihood), -jnp.inf, at_data.log_likelihood)
     return trace, smoothed.moments, {
-        "log_likelihood": log_likelihood, "leave_one_out": left_out, "whitened_innovation": residual,
-        "change": change, "log_likelihood_change": at_data.log_likelihood.sum() - previous,
-        "converged": jnp.asarray(True)}
+        "log_likelihood": log_likelihood, "leave_one_out": left_out, "entry_leave_one_out": entries,
+        "whitened_innovation": residual, "change": change,
+        "log_likelihood_change": at_data.log_likelihood.sum() - previous, "converged": jnp.asarray(True)}
 
 
 def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings,
@@ -276,15 +281,19 @@ def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings,
     fixed_point, points = result.refined.fixed_point, result.refined.points
     predictor = at_intervals(smoothed.predictor, problem.grid.observed)
     prequential = assumed_density_filter(problem, y)
-    fallback = -jnp.inf if points is None else prequential.log_likelihood
+    fallback = jnp.full(len(y), -jnp.inf) if points is None else prequential.log_likelihood
     left_out = leave_one_out(predictor, fixed_point.sites, result.entries)
     one_step_ahead, left_out = (jnp.where(fixed_point.converged, value, fallback)
                                 for value in (prequential.log_likelihood, left_out))
+    entries = entry_leave_one_out(predictor, fixed_point.sites, result.entries)
+    counts = jnp.maximum(jnp.isfinite(y).sum(axis=1), 1)
+    entries = jnp.where(fixed_point.converged, entries, (fallback / counts)[:, None])
     change = jnp.asarray(jnp.nan) if points is None else fixed_point.change
     residual = quantile_residuals(family, prequential.prediction, y)
     return result.trace, smoothed.moments, {
-        "log_likelihood": one_step_ahead, "leave_one_out": left_out, "whitened_innovation": residual,
-        "change": change, "log_likelihood_change": jnp.asarray(jnp.nan), "converged": fixed_point.converged}
+        "log_likelihood": one_step_ahead, "leave_one_out": left_out, "entry_leave_one_out": entries,
+        "whitened_innovation": residual, "change": change, "log_likelihood_change": jnp.asarray(jnp.nan),
+        "converged": fixed_point.converged}
 
 
 _compiled_smooth = shared_jit(smooth_on)

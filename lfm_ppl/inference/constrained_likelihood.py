@@ -25,7 +25,7 @@ from lfm_ppl.constrained.constraints import build_constraints
 from lfm_ppl.constrained.evidence import TruncatedPosterior, check_linear, check_variances
 from lfm_ppl.constrained.full_information import check_settings
 from lfm_ppl.filtering.backward import backward
-from lfm_ppl.filtering.ep.evidence import leave_one_out
+from lfm_ppl.filtering.ep.evidence import entry_leave_one_out
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA
 from lfm_ppl.filtering.moments import Record
@@ -190,7 +190,7 @@ class ConstrainedLikelihood(SeriesLikelihood):
         return path[index], jnp.asarray(times)
 
     def leave_one_out(self, y: jax.Array, smoothed: SmootherResult) -> jax.Array:
-        """Return (T,), log p(y_k | y_-k, c), by expectation propagation."""
+        """Return (T, D), log p of each entry given all others and the constraints, by expectation propagation."""
         posterior = self.truncated_posterior()
         propagated = posterior.propagate_expectations(y, Record.SMOOTHER)
         predictor = backward(posterior.problem, propagated.trace).predictor
@@ -201,7 +201,7 @@ class ConstrainedLikelihood(SeriesLikelihood):
                                    covariance=at_data.covariance[:, :outputs, :outputs])
         fixed_point = propagated.refined.fixed_point
         sites = Sites(*(a[data, :outputs] for a in fixed_point.sites))
-        value = leave_one_out(at_data, sites, propagated.entries[data, :outputs])
+        value = entry_leave_one_out(at_data, sites, propagated.entries[data, :outputs])
         return jnp.where(fixed_point.converged, value, -jnp.inf)
 
 

@@ -1,10 +1,11 @@
 """Predictive densities, residuals and trajectories under posterior draws of the parameters.
 
-1. `scores` smooths the data under each draw: leave-one-out and one-step-ahead terms, residuals.
+1. `scores` smooths the data under each draw: leave-one-out and one-step-ahead terms, residuals, and replicated data
+   along a path.
 2. `trajectories` draws one path of state and forces under each draw: from the smoother up to the last observation, and
    by simulation of the non-linear model after it; or from particle filters.
-3. Along the path it draws replicated data and predictions, and it stores the normal distribution of each output where
-   there is one, which gives sharper predictive densities than the path.
+3. Along the path it draws new observations, and it stores the normal distribution of each output where there is one,
+   which gives sharper predictive densities than the path.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from lfm_ppl.inference.map_draws import BatchStore, map_draws
 from lfm_ppl.inference.path_plan import PathPlan, first_simulated_times, has_forecast, plan_paths
 from lfm_ppl.inference.problem import Partition, Problem, signature
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
-from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, with_noise
+from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, replicate, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.simulate import LONGEST_PRODUCT, input_breakpoints, simulate_missing_states
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -50,37 +51,50 @@ LOG_PRIOR = "log prior of "
 """Start of the names of the log prior densities among the scores."""
 
 
-def scores(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], *,
+def scores(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], particles: ParticleSettings | None = None,
+           particle_steps: int | None = None, *,
            report: Reporter | None = None, store: BatchStore | None = None) -> Any:
-    """Score the observations under each draw.
+    """Score the observations under each draw, and replicate the data along a path given the data.
 
     Args:
-        key: a JAX random key, for likelihoods that draw a further parameter, such as a path of regimes.
+        key: a JAX random key, for the path, the noise, and further parameters such as regimes.
         bound: the model and its data.
         draws: site name -> (S, ...).
+        particles: settings of the particle smoother that draws the path; None: the Gaussian smoother.
+        particle_steps: integration steps of the particles between two observations; None: the model's.
         report: as in `map_draws`.
         store: as in `map_draws`.
 
     Returns:
-        ``leave_one_out`` (S, ..., T), ``one_step_ahead`` (S, ..., T), ``residual`` (S, ..., T, D); the series of a
-        panel come after the draws. Under constraints the last two ignore the constraints. The log prior density (S,)
-        of each site has the name of the site after `LOG_PRIOR`.
+        ``leave_one_out`` (S, ..., T, D), log p of each entry given all others, without a meaning where the entry is
+        missing; ``one_step_ahead`` (S, ..., T); ``residual`` and ``replicate`` (S, ..., T, D); the series of a panel
+        come after the draws. Under constraints ``one_step_ahead`` and ``residual`` ignore the constraints. The log
+        prior density (S,) of each site has the name of the site after `LOG_PRIOR`.
     """
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
         log_priors = {LOG_PRIOR + name: value for name, value in bound.site_log_priors(values, y).items()}
         distribution, y = bound.likelihood(values, y), bound.data(y)
-        keys = distribution.split_key(key)
-        return distribution.mapped(lambda series, y, key: series.scores(key, y), y, keys) | log_priors
+        return distribution.mapped(of_series, y, distribution.split_key(key)) | log_priors
 
-    return map_draws(bound, "scores", per_draw, draws, key, rows=bound.times.size,
+    def of_series(series: SeriesLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
+        if particles is None:
+            return series.scores(key, y)
+        keys = split_by_name(key, ("scores", "path", "noise"))
+        w, times = _particle_path(series, y, None, keys["path"], particles, particle_steps or series.steps)
+        return series.scores(keys["scores"], y) | {"replicate": replicate(series.ssm, keys["noise"], w, times)}
+
+    rows = bound.times.size * (1 if particles is None else particles.particles)
+    problem = bound.problem if particles is None else bound.constants  # a particle filter needs the values of the times
+    return map_draws(bound, ("scores", particles, particle_steps), per_draw, draws, key, rows=rows,
+                     arguments=(problem,),
                      report=report, store=store)
 
 
 def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
                  particles: ParticleSettings | None = None, particle_steps: int | None = None, *,
                  report: Reporter | None = None, store: BatchStore | None = None) -> Any:
-    """Draw one trajectory for each draw of the parameters, given the data, and new data along it.
+    """Draw one trajectory for each draw of the parameters, given the data, and new observations along it.
 
     Up to the last observation the path is a draw of the smoother. After it, non-linear dynamics are simulated: see
     `lfm_ppl.forecast` for the reason. Where a step of that is too long, the paths are simulated once more with
@@ -98,8 +112,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
 
     Returns:
         ``state`` (S, ..., K, M), ``force`` (S, ..., K, R), ``deterministic`` (S, ..., K, Q), ``output`` (S, ..., K, D)
-        without noise (the expectation of a family); ``y`` (S, ..., T, D), the posterior predictive at the observation
-        times; ``prediction`` (S, ..., K, D), new observations at the times of the trajectories. For Gaussian
+        without noise (the expectation of a family); ``prediction`` (S, ..., K, D), new observations at the times of
+        the trajectories. For Gaussian
         observations ``predictive_mean`` and ``predictive_sd`` (S, ..., K, D), the normal distribution of each given the
         parameters (where the observation is linear, up to the last one) or given the path, so that the mixture over the
         draws is the predictive density, and ``output_sd`` (S, ..., K, D), the sd without the noise. ``prediction`` and
@@ -159,6 +173,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
                     layout: GridLayout | None = None) -> dict[str, jax.Array]:
         ssm = distribution.ssm
         keys = split_by_name(key, ("path", "replicate", "forecast", "points", "prediction"))
+        noise_key = keys["replicate" if requested_times is None else "prediction"]
         results: dict[str, jax.Array] = {}
         if particles is None and not distribution.has_gaussian_state:
             smoothed = None
@@ -186,19 +201,16 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
             smoothed = None
             w, when = _particle_path(distribution, y, path_times, keys["path"], particles,
                                      particle_steps or plan.smoother_steps or distribution.steps)
-        requested, data = plan.requested, plan.data
+        requested = plan.requested
         results["deterministic"] = jax.vmap(ssm.deterministics)(w[requested], when[requested])
         if isinstance(ssm.model.observation, ObservationFamily):
-            results |= _of_family(ssm, keys, w, when, plan)
+            results |= _of_family(ssm, noise_key, w, when, plan)
             if requested_times is not None and has_row_noise:
                 del results["prediction"]
             return results
         output = jax.vmap(ssm.observe)(w, when)
-        covariance = jax.vmap(ssm.obs_cov)(w[data], when[data], jnp.arange(len(data)))
-        replicated = with_noise(keys["replicate"], output[data], covariance)
         size = ssm.physical_dim
-        results |= {"state": w[requested, :size], "force": w[requested, size:], "output": output[requested],
-                    "y": replicated}
+        results |= {"state": w[requested, :size], "force": w[requested, size:], "output": output[requested]}
         mean = output[requested]
         variance = jnp.zeros_like(mean)
         if smoothed is not None and _normal_outputs(ssm):
@@ -211,10 +223,9 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
         results |= {"predictive_mean": mean, "output_sd": jnp.sqrt(variance)}
         if requested_times is not None and has_row_noise:
             return results
-        prediction = replicated
-        if requested_times is not None:
-            covariance = jax.vmap(ssm.obs_cov)(w[requested], when[requested], jnp.zeros(len(requested), int))
-            prediction = with_noise(keys["prediction"], output[requested], covariance)
+        rows = jnp.arange(len(requested)) if requested_times is None else jnp.zeros(len(requested), int)
+        covariance = jax.vmap(ssm.obs_cov)(w[requested], when[requested], rows)
+        prediction = with_noise(noise_key, output[requested], covariance)
         noise = jnp.diagonal(covariance, axis1=1, axis2=2)
         return results | {"prediction": prediction, "predictive_sd": jnp.sqrt(variance + noise)}
 
@@ -237,29 +248,24 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
         name = (*name, len(plan.requested), plan.rows, requested_times is None, plan.steps if is_forecast else None)
         paths = map_draws(bound, name, shared_per_draw, draws, key, rows=plan.rows,
                           arguments=(bound.problem, plan.times, bound.requested(reached)), **options)
-        return {name: value if name in ("y", "log_likelihood", _PRODUCT) else value[..., :count, :]
+        return {name: value if name in ("log_likelihood", _PRODUCT) else value[..., :count, :]
                 for name, value in paths.items()}
     rows = plan.rows * (1 if particles is None else particles.particles)
     return map_draws(bound, (*name, signature(requested_times), signature(plan)), per_draw, draws, key, rows=rows,
                      arguments=(bound.constants,), **options)
 
 
-def _of_family(ssm: StateSpaceModel, keys: Mapping[str, jax.Array], w: jax.Array, when: jax.Array,
+def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Array,
                plan: PathPlan) -> dict[str, jax.Array]:
-    """Return outputs, replicated data and predictions along one path (L, M + R), for an observation family.
-
-    ``keys`` are random keys of "replicate" and "prediction".
-    """
-    size, requested, data = ssm.physical_dim, plan.requested, plan.data
+    """Return outputs and new observations along one path (L, M + R), for an observation family."""
+    size, requested = ssm.physical_dim, plan.requested
     output = jax.vmap(lambda w, t: expected_observation(ssm, w, t))(w[requested], when[requested])
-    replicated = jax.vmap(lambda w, t, key, row: noisy_observation(ssm, w, t, key, row))(
-        w[data], when[data], jax.random.split(keys["replicate"], len(data)), jnp.arange(len(data)))
-    prediction = replicated
-    if plan.times is not None:
+    if plan.times is None:
+        prediction = replicate(ssm, key, w, when)
+    else:
         prediction = jax.vmap(lambda w, t, key: noisy_observation(ssm, w, t, key, None))(
-            w[requested], when[requested], jax.random.split(keys["prediction"], len(requested)))
-    return {"state": w[requested, :size], "force": w[requested, size:], "output": output, "y": replicated,
-            "prediction": prediction}
+            w[requested], when[requested], jax.random.split(key, len(requested)))
+    return {"state": w[requested, :size], "force": w[requested, size:], "output": output, "prediction": prediction}
 
 
 def _last_observed(y: jax.Array, when: jax.Array, plan: PathPlan) -> jax.Array:

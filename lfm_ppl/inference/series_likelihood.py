@@ -40,10 +40,12 @@ from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.events import EventTable, event_table
 from lfm_ppl.model.inputs import InputRead
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation_noise import replicate
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
+from lfm_ppl.utils.random_keys import split_by_name
 
 
 class SeriesLikelihood(Likelihood):
@@ -301,14 +303,25 @@ class SeriesLikelihood(Likelihood):
         raise NotImplementedError
 
     def scores(self, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
-        """Return scores of the rows of ``y`` (T, D): "leave_one_out" and "one_step_ahead" (T,), "residual" (T, D)."""
+        """Return scores of ``y`` (T, D), and new data along a path given ``y``.
+
+        Returns:
+            "leave_one_out" (T, D), log p of each entry given all others, without a meaning where it is missing;
+            "one_step_ahead" (T,); "residual" and "replicate" (T, D).
+        """
+        keys = split_by_name(key, ("path", "noise"))
         result = self.smooth(y)
+        if self.has_gaussian_state:
+            states, times = result.sample_joint(keys["path"], 1)[0], result.times
+            w = jax.vmap(self.ssm.inputs)(states, times)
+        else:
+            w, times = self.sample_path(keys["path"], y)
         return {"leave_one_out": self.leave_one_out(y, result), "one_step_ahead": result.log_likelihood,
-                "residual": result.whitened_innovation}
+                "residual": result.whitened_innovation, "replicate": replicate(self.ssm, keys["noise"], w, times)}
 
     def leave_one_out(self, y: jax.Array, smoothed: SmootherResult) -> jax.Array:
-        """Return (T,), log p(y_k | y_-k), given the result of `smooth`."""
-        return smoothed.leave_one_out
+        """Return (T, D), log p of each entry given all others, given the result of `smooth`."""
+        return smoothed.entry_leave_one_out
 
     def convergence(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return whether the sites converge, and whether the log density is finite."""

@@ -36,6 +36,7 @@ from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observation_noise import replicate
 from lfm_ppl.model.resolution import check_resolution
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.model.stiff_simulation import warn_of_infinite_states
@@ -57,6 +58,7 @@ from lfm_ppl.switching.switched_simulation import simulate_paths
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
 from lfm_ppl.utils.programs import Program
+from lfm_ppl.utils.random_keys import split_by_name
 
 SMOOTHER_DRAWS = 256
 """Draws of regimes over which the smoother averages; they have the same random numbers in each call."""
@@ -283,17 +285,20 @@ class Switching(SeriesLikelihood):
             trace.log_likelihood[jnp.asarray(grid.observed)], self.regime_names)
 
     def scores(self, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
-        """Return densities and residuals of the rows, with a path of regimes as a further parameter of the draw.
+        """Return scores and new data, with a path of regimes r as a further parameter of the draw; see the base class.
 
-        The leave-one-out density is log p(y_k | y_-k, r), so that leave-one-out cross-validation weights the paths with
-        the parameters.
+        The leave-one-out density is log p(y_kd | y_-kd, r), so that leave-one-out cross-validation weights the paths
+        with the parameters. The new data belong to the same path.
         """
         regimes, observed = self.regimes(), jnp.asarray(self.time_grid.observed)
+        keys = split_by_name(key, ("path", "states", "noise"))
         trace = filter_regimes(regimes, y)
-        path = sample_regimes(key, regimes, trace, y, 1)[0][:, 0]
-        left_out = smooth_path(regimes, y, path).leave_one_out
+        path = sample_regimes(keys["path"], regimes, trace, y, 1)[0][:, 0]
+        left_out = smooth_path(regimes, y, path).entry_leave_one_out
+        states, times = sample_states(keys["states"], regimes, y, path)[observed], jnp.asarray(self.times, float)
+        w = self._inputs_of_regimes(states, path[observed], times)
         return {"leave_one_out": left_out[observed], "one_step_ahead": trace.log_likelihood[observed],
-                "residual": trace.residual[observed]}
+                "residual": trace.residual[observed], "replicate": replicate(self.ssm, keys["noise"], w, times)}
 
     def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
         """Draw a trajectory given the data, whose state is (x, indicators of the regimes); see the base class."""
@@ -303,8 +308,7 @@ class Switching(SeriesLikelihood):
         path = sample_regimes(path_key, regimes, filter_regimes(regimes, y), y, 1)[0][:, 0]
         states = sample_states(state_key, regimes, y, path)[requested]
         indices, times = path[requested], jnp.asarray(grid.requested_times, float)
-        candidates = jnp.stack([jax.vmap(ssm.inputs)(states, times) for ssm in self.ssms])
-        return self._with_indicators(candidates[indices, jnp.arange(len(times))], indices), times
+        return self._inputs_of_regimes(states, indices, times), times
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate the real model: (*sample_shape, T, D).
@@ -332,6 +336,11 @@ class Switching(SeriesLikelihood):
         schemes = tuple(choose_scheme(ssm, "auto") for ssm in ssms)
         w, y, indices, _ = simulate_paths(problem, schemes, jnp.asarray(times), path_key)
         return self._with_indicators(w[:, 0], indices[:, 0]), y[:, 0]
+
+    def _inputs_of_regimes(self, states: jax.Array, indices: jax.Array, times: jax.Array) -> jax.Array:
+        """Return (x, indicators of the regimes, u) (T, M + K + R) of joint states (T, n) in the regimes (T,)."""
+        candidates = jnp.stack([jax.vmap(ssm.inputs)(states, times) for ssm in self.ssms])
+        return self._with_indicators(candidates[indices, jnp.arange(len(times))], indices)
 
     def _with_indicators(self, w: jax.Array, indices: jax.Array) -> jax.Array:
         size = len(self.models[0].state_names)

@@ -58,6 +58,13 @@ def noisy_observation(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, key: jax
     return with_noise(key, predictor, ssm.obs_cov(w, t, row))
 
 
+def replicate(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, times: jax.Array) -> jax.Array:
+    """Draw the rows of data (T, D) along a path w (T, M + R), each with the noise of its row."""
+    rows = jnp.arange(len(times))
+    return jax.vmap(lambda w, t, key, row: noisy_observation(ssm, w, t, key, row))(
+        w, times, jax.random.split(key, len(times)), rows)
+
+
 def with_noise(key: jax.Array, mean: jax.Array, covariance: jax.Array) -> jax.Array:
     """Return a draw of N(mean, covariance): (D,) and (D, D), or (K, D) and (K, D, D)."""
     root = semidefinite_root if covariance.ndim == 2 else jax.vmap(semidefinite_root)

@@ -17,8 +17,10 @@ from lfm_ppl.results.report import AccuracyReport
 from lfm_ppl.results.series import TIMES, times_of
 from lfm_ppl.utils import checks
 
-_KEPT = ("observed_data", "truth")
-_DRAWN = ("trajectories", "posterior_predictive")
+_KEPT = ("data", "observed_data", "truth")
+_OF_DRAWS = ("posterior", "log_likelihood", "log_prior", "posterior_predictive")
+"""Groups that depend on the draws alone, and are picked with them."""
+
 _KINDS = {"states": "state", "forces": "force", "outputs": "output"}
 
 
@@ -29,7 +31,7 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
 
     Draws that the weights favour appear more than once, so that diagnostics of chains say nothing here; the report
     gives the effective number of draws. Trajectories are drawn again by the Gaussian smoother at the corrected
-    parameters.
+    parameters; log likelihood and replicated data are those of the draws.
 
     Args:
         result: of `lfm_ppl.fit`, with the report that `check_accuracy` stored; check at many draws (1,000) first.
@@ -41,8 +43,8 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
         seed: of the resampling and the trajectories.
 
     Returns:
-        An ArviZ object with the groups posterior, observed_data, truth, trajectories and posterior_predictive, where
-        the result has them, and its attributes.
+        An ArviZ object with the groups posterior, data, observed_data, log_likelihood, log_prior, posterior_predictive,
+        truth and trajectories, where the result has them, and its attributes.
 
     Raises:
         ValueError: there is no report, or its weights cannot be relied on.
@@ -60,10 +62,12 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
     draw_index = np.searchsorted(posterior["draw"].values, report.dataset["draw"].values)
     of_all = (np.arange(chains)[:, None] * posterior.sizes["draw"] + draw_index).ravel()
     picked = of_all[importance.resample(report.log_weight, chains * size, seed)].reshape(chains, size)
-    groups = {"posterior": _select_draws(posterior, picked)}
+    groups = {name: _select_draws(arviz_data.group(result, name), picked) for name in _OF_DRAWS
+              if arviz_data.has_group(result, name)}
     groups |= {name: arviz_data.group(result, name) for name in _KEPT if arviz_data.has_group(result, name)}
     if trajectory_draws and arviz_data.has_group(result, "trajectories"):
-        groups |= _paths(result, numpyro_model, times, y, model_kwargs, picked, trajectory_draws, seed)
+        groups["trajectories"] = _draw_trajectories(result, numpyro_model, times, y, model_kwargs, picked,
+                                                    trajectory_draws, seed)
     attrs = arviz_data.attributes(result)
     attrs |= {"sampler": f"{attrs.get('sampler', 'unknown')} + importance resampling", "chains": chains,
               "samples": size, "reference": report.reference, "pareto_k": report.k, "effective_draws": report.ess,
@@ -71,40 +75,36 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
     return arviz_data.build(groups, attrs)
 
 
-def _select_draws(posterior: xr.Dataset, picked: np.ndarray) -> xr.Dataset:
+def _select_draws(dataset: xr.Dataset, picked: np.ndarray) -> xr.Dataset:
     """Return the draws ``picked`` (C, S), indices into all chains joined, as chains."""
-    chain, draw = (xr.DataArray(index, dims=("chain", "draw")) for index in np.divmod(picked, posterior.sizes["draw"]))
-    selected = posterior.drop_vars(["chain", "draw"], errors="ignore").isel(chain=chain, draw=draw)
+    chain, draw = (xr.DataArray(index, dims=("chain", "draw")) for index in np.divmod(picked, dataset.sizes["draw"]))
+    selected = dataset.drop_vars(["chain", "draw"], errors="ignore").isel(chain=chain, draw=draw)
     return selected.transpose("chain", "draw", ...).assign_coords(
         chain=np.arange(picked.shape[0]), draw=np.arange(picked.shape[1]))
 
 
-def _paths(result: Any, numpyro_model: Callable, times: Any, y: Any, model_kwargs: Mapping[str, Any] | None,
-           picked: np.ndarray, count: int, seed: int) -> dict[str, xr.Dataset]:
+def _draw_trajectories(result: Any, numpyro_model: Callable, times: Any, y: Any,
+                       model_kwargs: Mapping[str, Any] | None, picked: np.ndarray, count: int,
+                       seed: int) -> xr.Dataset:
     """Draw trajectories at some of the picked draws, in the layout of ``result``."""
-    templates = {name: arviz_data.group(result, name) for name in _DRAWN if arviz_data.has_group(result, name)}
-    template = templates["trajectories"]
+    template = arviz_data.group(result, "trajectories")
     path_times = times_of(template, "at").values if {"at", TIMES} & set(template.coords) else None
     draw_index, rows = evenly_spaced(picked.shape[0], picked.shape[1], count)
     problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs).select(picked.ravel()[rows])
     paths = {label: values.reshape(picked.shape[0], len(draw_index), *values.shape[1:]) for label, values in
              trajectories(jax.random.key(seed), problem.bound, problem.draws, path_times).items()}
-    groups = {}
-    for name, old in templates.items():
-        variables = {}
-        for label, variable in old.data_vars.items():
-            if "draw" not in variable.dims or label == "deterministics":  # computed again below
-                continue
-            kind = _KINDS[str(label)] if name == "trajectories" else "y"
-            variables[label] = (variable.transpose("chain", "draw", ...).dims, paths[kind], variable.attrs)
-        coords = {key: value for key, value in old.coords.items() if key not in ("chain", "draw", "statistic")}
-        groups[name] = xr.Dataset(variables, coords | {"chain": np.arange(picked.shape[0]), "draw": draw_index})
+    variables = {}
+    for label, variable in template.data_vars.items():
+        if "draw" not in variable.dims or label == "deterministics":  # computed again below
+            continue
+        variables[label] = (variable.transpose("chain", "draw", ...).dims, paths[_KINDS[str(label)]], variable.attrs)
+    coords = {key: value for key, value in template.coords.items() if key not in ("chain", "draw", "statistic")}
+    new = xr.Dataset(variables, coords | {"chain": np.arange(picked.shape[0]), "draw": draw_index})
     # The model may have other deterministics than when it was fitted.
-    names, new = list(problem.bound.site.example.ssm.model.deterministic_names), groups["trajectories"]
+    names = list(problem.bound.site.example.ssm.model.deterministic_names)
     new = new.drop_vars("deterministic", errors="ignore")
     if names:
         dims = [*new["outputs"].dims[:-1], "deterministic"]
         attrs = template["deterministics"].attrs if "deterministics" in template else {}
         new = new.assign(deterministics=(dims, paths["deterministic"], attrs)).assign_coords(deterministic=names)
-    groups["trajectories"] = with_summaries(new, paths)
-    return groups
+    return with_summaries(new, paths)

@@ -115,7 +115,7 @@ def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figur
         failures=failures, convergence=table[diagnostics] if diagnostics and len(table) else None,
         model={"name": attrs.get("model"), "file": attrs.get("model_file"), "paragraphs": _paragraphs(description),
                "priors": _priors(attrs), "assumptions": json.loads(str(attrs.get("assumptions", "{}")))},
-        data=_data(result, attrs) if arviz_data.has_group(result, "observed_data") else {},
+        data=_data(result, attrs) if arviz_data.has_group(result, "data") else {},
         settings={name: text for name, value in attrs.items()
                   if name not in _NOT_SETTINGS and (text := _plain(value))} or None,
         repeat={"commands": _commands(result, attrs), "note": ""}, files=_files(path) or None)
@@ -211,7 +211,7 @@ def _paragraphs(text: str) -> list[tuple[bool, str]]:
 
 
 def _data(result: Any, attrs: Mapping[str, Any]) -> dict[str, Any]:
-    dataset = arviz_data.group(result, "observed_data")
+    dataset = arviz_data.group(result, "data")
     name = next(str(label) for label in dataset.data_vars if label != TIMES)
     variable, origin = dataset[name], _origin(result)
     times = np.asarray(times_of(dataset).values, float)

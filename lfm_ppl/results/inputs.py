@@ -81,7 +81,7 @@ def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | Non
 
 def time_unit(result: Any) -> str:
     """Return the unit of time, empty where the result does not know it."""
-    for name, coordinate in (("observed_data", "time"), ("observed_data", "times"), ("trajectories", "at")):
+    for name, coordinate in (("data", "time"), ("data", "times"), ("trajectories", "at")):
         if arviz_data.has_group(result, name) and coordinate in (dataset := arviz_data.group(result, name)).coords:
             if unit := unit_of(dataset[coordinate]):
                 return unit

@@ -1,7 +1,8 @@
 """Layout of the groups of a result: variables, dimensions, coordinates and units.
 
 1. Name the dimensions of each site by plates, outputs, or the user's labels.
-2. Lay out posterior, sampler statistics, observed data, scores, trajectories, predictions and truth as datasets.
+2. Lay out posterior, sampler statistics, data, scores, trajectories, predictions and truth as datasets. The groups that
+   ArviZ compares with each other have one dimension for all observed entries: ArviZ knows no missing values.
 3. Add means and 95% intervals to trajectories, from the mixture of normal distributions over the draws.
 """
 
@@ -23,7 +24,7 @@ from lfm_ppl.io.truth import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
 from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, PERIODS, REGIMES, mixture_quantiles, predictions
 from lfm_ppl.results.scalars import DERIVED, units_attribute
-from lfm_ppl.results.series import SERIES, plate_dimension, time_coordinate
+from lfm_ppl.results.series import ENTRY, SERIES, plate_dimension, time_coordinate, times_of
 from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:
@@ -169,30 +170,38 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
     def variable(dims: Sequence[str], values: Any, names: Sequence[str] = ()) -> tuple:
         return tuple(dims), np.asarray(values), units_attribute(names, units)
 
-    # A time at which nothing was observed has no predictive density to compare.
-    seen = np.flatnonzero(np.isfinite(np.asarray(y)).any(axis=-1).reshape(-1, np.shape(y)[-2]).any(axis=0))
     sample = ("chain", "draw", *along)
     which = {name: labels.coords[name] for name in panel}
-    observed_coords = {**clock, **which, "output": named["output"]}
+    data_coords = {**clock, **which, "output": named["output"]}
+    data = xr.Dataset({site.name: variable((*along, "output"), y, named["output"])}, data_coords)
+    is_observed = np.isfinite(y)
+    entries = entry_coordinates(data, is_observed)
     groups = {
         # Between sites, outputs differ: a parameter with an entry for each output of one site may belong to another.
         "posterior": _posterior(draws, coords, {**named, OUTPUT: []} if bound.is_by_site else named, labels),
         "sample_stats": xr.Dataset({k: (("chain", "draw"), v) for k, v in stats.items()}, coords),
-        "observed_data": xr.Dataset({site.name: variable((*along, "output"), y, named["output"])}, observed_coords),
+        "data": data,
+        "observed_data": xr.Dataset({site.name: (ENTRY, y[is_observed], data[site.name].attrs)}, entries),
     }
     if scores is not None:
         split = {label: value.reshape(chains, samples, *value.shape[1:]) for label, value in scores.items()}
-        left_out = xr.Dataset({site.name: variable(sample, split["leave_one_out"])}, {**coords, **clock, **which})
-        groups["log_likelihood"] = left_out.isel(time=seen)
+        of_entries = ("chain", "draw", ENTRY)
+        groups["log_likelihood"] = xr.Dataset(
+            {site.name: (of_entries, split["leave_one_out"][:, :, is_observed])}, {**coords, **entries})
+        groups["posterior_predictive"] = xr.Dataset(
+            {site.name: (of_entries, split["replicate"][:, :, is_observed], data[site.name].attrs)},
+            {**coords, **entries})
+        counted = [groups[name] for name in ("observed_data", "posterior_predictive")]
+        if all(_are_whole(dataset[site.name].values) for dataset in counted):  # ArviZ knows counts by their type
+            for dataset in counted:
+                dataset[site.name] = dataset[site.name].astype(int)
         groups["log_prior"] = xr.Dataset({label.removeprefix(LOG_PRIOR): (("chain", "draw"), value)
                                           for label, value in split.items() if label.startswith(LOG_PRIOR)}, coords)
         groups["one_step_ahead"] = xr.Dataset(
             {"log_density": variable(sample, split["one_step_ahead"]),
-             "residual": variable((*sample, "output"), split["residual"])}, {**coords, **observed_coords})
+             "residual": variable((*sample, "output"), split["residual"])}, {**coords, **data_coords})
     if paths is not None:
         thinned = {"chain": np.arange(chains), "draw": draw_index}
-        groups["posterior_predictive"] = xr.Dataset(
-            {site.name: variable((*sample, "output"), paths["y"], named["output"])}, {**thinned, **observed_coords})
         dimensions = ("chain", "draw", *panel, "at")
         at_coords = {} if grid is None else time_coordinate("at", grid, panel, units)
         groups["trajectories"] = xr.Dataset(
@@ -216,6 +225,24 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
                 truth_group = truth_group.drop_dims(kind)
             groups["truth"] = truth_group.assign(new).assign_coords({kind: named[kind]})
     return groups
+
+
+def _are_whole(values: np.ndarray) -> bool:
+    return bool(np.isfinite(values).all() and (values == np.round(values)).all())
+
+
+def entry_coordinates(data: xr.Dataset, is_observed: np.ndarray) -> dict[str, Any]:
+    """Return time, output and series of each observed entry, along the dimension `ENTRY`.
+
+    Args:
+        data: of one site, with dimensions (time, output) or (series, time, output).
+        is_observed: whether an entry of the data is observed, of the shape of the data.
+    """
+    dims = list(next(data[name].dims for name in data.data_vars))
+    times = times_of(data).transpose(*(dim for dim in dims if dim in times_of(data).dims))
+    index = dict(zip(dims, np.nonzero(is_observed), strict=True))
+    coordinates = {str(dim): (ENTRY, data[dim].values[index[dim]]) for dim in dims if dim != "time"}
+    return {"time": (ENTRY, times.values[tuple(index[str(dim)] for dim in times.dims)], times.attrs), **coordinates}
 
 
 def force_periods(model: LatentForceModel) -> dict[str, float]:

@@ -46,10 +46,10 @@ def observations(result: Any) -> tuple[Any, Any]:
     """
     if sites := {name: observations(select_site(result, name)) for name in arviz_data.sites_of(result)}:
         return {name: times for name, (times, _) in sites.items()}, {name: y for name, (_, y) in sites.items()}
-    data = arviz_data.group(result, "observed_data")
+    data = arviz_data.group(result, "data")
     names = [name for name in data.data_vars if name != TIMES]
     if len(names) != 1 or not {TIMES, "time"} & set(data.variables):
-        raise ValueError(f"the group observed_data holds {', '.join(map(str, data.variables)) or 'nothing'}; expected "
+        raise ValueError(f"the group data holds {', '.join(map(str, data.variables)) or 'nothing'}; expected "
                          "one variable of observations and their times. Pass times and y.")
     return np.asarray(times_of(data).values, float), np.asarray(data[names[0]].values, float)
 

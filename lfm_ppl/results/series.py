@@ -1,9 +1,10 @@
 """The series of a panel in a result: the name of their dimension, their labels, and one of them alone.
 
-1. The dimension of the series has the name of the plate, and is a dimension of ``observed_data``.
+1. The dimension of the series has the name of the plate, and is a dimension of the group ``data``.
 2. Where series have times of their own, the coordinate ``times`` of a group holds them, one row for each series.
-3. `select_series` takes one entry of that dimension in every group, and drops the rows that pad the series.
-4. `panel_of` returns a panel for the model of all series, in which the other series have no data.
+3. In groups of observed entries the dimension is a coordinate of the entries.
+4. `select_series` takes one series in every group, and drops the rows that pad it.
+5. `panel_of` returns a panel for the model of all series, in which the other series have no data.
 """
 
 from __future__ import annotations
@@ -29,7 +30,10 @@ SERIES = "series"
 TIMES = "times"
 """Coordinate (series, time) or (series, at) of series that have times of their own."""
 
-_OTHER_DIMENSIONS = ("chain", "draw", "time", "at", "at_truth", "output", "state", "force", "deterministic",
+ENTRY = "observation"
+"""Dimension of the observed entries, with the coordinates time, output and series, in the groups that ArviZ reads."""
+
+_OTHER_DIMENSIONS = (ENTRY, "chain", "draw", "time", "at", "at_truth", "output", "state", "force", "deterministic",
                      "statistic", "parameter")
 """Dimensions of a result that a plate cannot give its name to."""
 
@@ -50,15 +54,15 @@ def plate_dimension(bound: BoundModel) -> str | None:
 
 def series_dimension(result: Any) -> str | None:
     """Return the dimension of the series of a result; None where it is of one series."""
-    if not arviz_data.has_group(result, "observed_data") or arviz_data.sites_of(result):
+    if not arviz_data.has_group(result, "data") or arviz_data.sites_of(result):
         return None
-    dims = arviz_data.group(result, "observed_data").dims
+    dims = arviz_data.group(result, "data").dims
     return next((str(name) for name in dims if name not in _OTHER_DIMENSIONS), None)
 
 
 def series_labels(result: Any) -> list[Any]:
     """Return the labels of the series of a panel, or their positions where a result has none."""
-    return arviz_data.group(result, "observed_data")[series_dimension(result)].values.tolist()
+    return arviz_data.group(result, "data")[series_dimension(result)].values.tolist()
 
 
 def times_of(dataset: xr.Dataset, clock: str = "time") -> xr.DataArray:
@@ -94,9 +98,9 @@ def select_series(result: Any, series: Any) -> Any:
         >>> y = xr.Dataset({"y": (("patient", "time", "output"), np.arange(4.0).reshape(2, 2, 1))})
         >>> y = y.assign_coords(patient=["Ann", "Bo"], time=[0.0, 1.0], output=["dose"])
         >>> draws = xr.Dataset({"rate": (("chain", "draw", "patient"), np.ones((1, 5, 2)))})
-        >>> panel = arviz_data.build({"posterior": draws.assign_coords(patient=["Ann", "Bo"]), "observed_data": y})
+        >>> panel = arviz_data.build({"posterior": draws.assign_coords(patient=["Ann", "Bo"]), "data": y})
         >>> one = select_series(panel, "Bo")
-        >>> one["observed_data"]["y"].values.ravel().tolist(), one["posterior"]["rate"].dims
+        >>> one["data"]["y"].values.ravel().tolist(), one["posterior"]["rate"].dims
         ([2.0, 3.0], ('chain', 'draw'))
     """
     dimension = series_dimension(result)
@@ -104,20 +108,17 @@ def select_series(result: Any, series: Any) -> Any:
         raise ValueError("the result is of one series, so that there is none to select; take the result.")
     labels = series_labels(result)
     index = _position(labels, series)
-    observed = arviz_data.group(result, "observed_data")
+    observed = arviz_data.group(result, "data")
     name = next(label for label in observed.data_vars if dimension in observed[label].dims and label != TIMES)
     is_observed = observed[name].notnull().any("output").transpose(dimension, "time").values
-    has_scores = is_observed[index][is_observed.any(axis=0)]
-    times = _select(observed, dimension, index)["time"].values
+    times = _select(observed, dimension, index, labels[index])["time"].values
     is_later = np.diff(times, prepend=-np.inf) > 0
     groups = {}
     for label in arviz_data.groups(result):
         if label in _NOT_OF_SERIES:
             continue
-        dataset = _select(arviz_data.group(result, label), dimension, index)
-        if label == "log_likelihood":
-            dataset = dataset.isel(time=has_scores)
-        elif label in ("observed_data", "one_step_ahead", "posterior_predictive"):
+        dataset = _select(arviz_data.group(result, label), dimension, index, labels[index])
+        if label in ("data", "one_step_ahead"):
             dataset = dataset.isel(time=is_observed[index] | is_later)
         elif label in (inputs.GROUP, inputs.FORECAST):
             dataset = _select_inputs(result, label, str(labels[index]))
@@ -166,11 +167,11 @@ def panel_of(result: Any) -> tuple[Any, Any]:
                 {TIMES: ((dimension, "time"), times, dataset["time"].attrs)})
         return filled.assign_coords({dimension: labels}) if panel["has_labels"] else filled
 
-    posterior, observed = (arviz_data.group(result, name) for name in ("posterior", "observed_data"))
+    posterior, observed = (arviz_data.group(result, name) for name in ("posterior", "data"))
     repeated = {name: posterior[name].expand_dims({dimension: len(labels)}, axis)
                 for name, axis in panel["axes"].items()}
     groups = {"posterior": posterior.assign(repeated),
-              "observed_data": without_others(observed, np.nan)}
+              "data": without_others(observed, np.nan)}
     if arviz_data.has_group(result, "one_step_ahead"):
         groups["one_step_ahead"] = without_others(arviz_data.group(result, "one_step_ahead"), 0.0)
     if arviz_data.has_group(result, inputs.GROUP):
@@ -207,8 +208,11 @@ def _position(labels: list[Any], series: Any) -> int:
     raise ValueError(checks.unknown("series", str(series), list(map(str, labels))))
 
 
-def _select(dataset: xr.Dataset, dimension: str, index: int) -> xr.Dataset:
+def _select(dataset: xr.Dataset, dimension: str, index: int, label: Any) -> xr.Dataset:
     """Return a group of one series, whose own times become the coordinate of the group."""
+    if dimension in dataset.coords and dataset[dimension].dims == (ENTRY,):
+        is_of_series = dataset[dimension].values == label
+        return dataset.isel({ENTRY: is_of_series}).drop_vars(dimension)
     if dimension in dataset.dims:
         dataset = dataset.isel({dimension: index}, drop=True)
     if TIMES not in dataset.variables:

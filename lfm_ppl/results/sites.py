@@ -1,9 +1,11 @@
 """Results of models with several likelihood sites: their layout, and the view of one site as a result of one site.
 
 1. Parameters, statistics of the sampler and the accuracy check are common to all sites.
-2. Groups of observations hold one variable for each site, with dimensions of its own: ``y`` over ``y_time``.
+2. Groups of observed entries hold one variable for each site, with a dimension of its own: ``y`` over
+   ``y_observation``. There the log likelihood has no coordinates, which ArviZ cannot stack across variables; they are
+   those of the observed data.
 3. Every other group belongs to one site and has its name: ``trajectories_y``.
-4. `select_site` keeps the data of the other sites in groups of their own, which the model needs for a forecast.
+4. `select_site` keeps the groups of the data of other sites, which the model needs for a forecast.
 """
 
 from __future__ import annotations
@@ -24,12 +26,12 @@ _COMMON = ("posterior", "sample_stats", "log_prior", "accuracy")
 _OBSERVED = ("observed_data", "log_likelihood", "posterior_predictive")
 """Groups with one variable for each site."""
 
-_OF_SITE = ("one_step_ahead", "trajectories", "predictions", "truth", "constant_data", "predictions_constant_data",
-            "held_out_data")
+_OF_SITE = ("data", "one_step_ahead", "trajectories", "predictions", "truth", "constant_data",
+            "predictions_constant_data", "held_out_data")
 """Groups that each site has for itself."""
 
-_OTHERS = "other_sites"
-"""Group of a selected site with the observations of the other ones, named as in a result with several sites."""
+_DATA = "data"
+"""Group of the observations of a site."""
 
 _SELECTED = "selected_site"
 """Attribute of a selected site: its name and the settings of all sites, as JSON."""
@@ -47,9 +49,10 @@ def merge_sites(sites: Mapping[str, Mapping[str, xr.Dataset]]) -> dict[str, xr.D
             if group in _COMMON:
                 merged.setdefault(group, dataset)
             elif group in _OBSERVED:
-                labels = (*dataset.dims, *({"times"} & set(dataset.variables)))
-                names = {label: f"{stored}_{label}" for label in labels if label not in ("chain", "draw")}
-                names[name] = stored
+                if group == "log_likelihood":
+                    dataset = dataset.drop_vars([label for label in dataset.coords if label not in ("chain", "draw")])
+                labels = {*dataset.dims, *dataset.coords} - {"chain", "draw"}
+                names = {label: f"{stored}_{label}" for label in labels} | {name: stored}
                 merged[group] = merged.get(group, xr.Dataset()).merge(dataset.rename(names))
             else:
                 merged[f"{group}_{stored}"] = dataset
@@ -68,21 +71,21 @@ def select_site(result: Result, name: str) -> Result:
 
     Returns:
         An ArviZ object with the groups of `lfm_ppl.fit`; it shares the arrays of ``result``. `lfm_ppl.forecast` takes
-        it with the model of all sites, whose data are in its groups ``other_sites`` and ``constant_data_SITE``.
+        it with the model of all sites, whose data are in its groups ``data_SITE`` and ``constant_data_SITE``.
 
     Raises:
         ValueError: the result has no such site.
 
     Example:
         >>> import numpy as np, lfm_ppl as lfm
-        >>> groups = {name: {"observed_data": xr.Dataset({name: (("time", "output"), np.zeros((count, 1)))})}
+        >>> groups = {name: {"observed_data": xr.Dataset({name: ("observation", np.zeros(count))})}
         ...           for name, count in (("short", 2), ("long", 5))}
         >>> merged = merge_sites(groups)["observed_data"]
         >>> merged["long"].dims
-        ('long_time', 'long_output')
+        ('long_observation',)
         >>> result = arviz_data.build({"observed_data": merged}, {"likelihood_sites": '{"short": {}, "long": {}}'})
         >>> lfm.select_site(result, "long")["observed_data"]["y"].dims
-        ('time', 'output')
+        ('observation',)
     """
     settings = arviz_data.sites_of(result)
     if name not in settings:
@@ -96,17 +99,17 @@ def select_site(result: Result, name: str) -> Result:
         if group in _COMMON:
             groups[group] = dataset
         elif group in _OBSERVED and stored in dataset:
-            part = dataset[[variable for variable in (stored, f"{stored}_times") if variable in dataset]]
+            part = dataset[[stored]]
             names = {label: str(label).removeprefix(f"{stored}_") for label in (*part.variables, *part.dims)}
             groups[group] = part.rename(names | {stored: _VARIABLE})
-            if group == "observed_data":
-                groups[_OTHERS] = dataset.drop_vars([label for label in dataset.variables if label in names])
         elif group != kind and kind in _OF_SITE:
             groups[kind] = dataset.rename({stored: _VARIABLE}) if stored in dataset else dataset
             if "observed" in dataset.attrs:
                 groups[kind] = groups[kind].assign_attrs(observed=_VARIABLE)
-        elif group.startswith(f"{inputs.GROUP}_"):
+        elif group.startswith((f"{inputs.GROUP}_", f"{_DATA}_")):
             groups[group] = dataset
+    if {"log_likelihood", "observed_data"} <= set(groups):
+        groups["log_likelihood"] = groups["log_likelihood"].assign_coords(groups["observed_data"].coords)
     attributes = {key: value for key, value in arviz_data.attributes(result).items() if key != arviz_data.LIKELIHOODS}
     selected = json.dumps({"name": name, "sites": settings})
     return arviz_data.build(groups, attributes | settings[name] | {_SELECTED: selected})
@@ -123,14 +126,12 @@ def all_sites_of(result: Any) -> tuple[Any, str]:
     selected = json.loads(attributes[_SELECTED])
     name, settings = selected["name"], selected["sites"]
     stored = name.replace("/", ".")
-    own = {group: arviz_data.group(result, group) for group in ("posterior", "observed_data", "one_step_ahead",
-                                                                inputs.GROUP) if arviz_data.has_group(result, group)}
-    own["observed_data"] = own["observed_data"].rename({_VARIABLE: name})
+    own = {group: arviz_data.group(result, group) for group in ("posterior", _DATA, "one_step_ahead", inputs.GROUP)
+           if arviz_data.has_group(result, group)}
+    own[_DATA] = own[_DATA].rename({_VARIABLE: name})
     groups = merge_sites({name: own})
-    if arviz_data.has_group(result, _OTHERS):
-        groups["observed_data"] = groups["observed_data"].merge(arviz_data.group(result, _OTHERS))
     groups |= {group: arviz_data.group(result, group) for group in arviz_data.groups(result)
-               if group.startswith(f"{inputs.GROUP}_") and group != f"{inputs.GROUP}_{stored}"}
+               if group.startswith((f"{inputs.GROUP}_", f"{_DATA}_")) and group not in groups}
     differing = {key for site in settings.values() for key in site}
     attributes = {key: value for key, value in attributes.items() if key not in (_SELECTED, *differing)}
     return arviz_data.build(groups, {**attributes, arviz_data.LIKELIHOODS: json.dumps(settings)}), name

@@ -181,21 +181,25 @@ def fit(
         - ``posterior``: parameters, with coordinates; sites of ``numpyro.deterministic`` have the attribute
           ``derived``;
         - ``sample_stats``;
-        - ``log_likelihood``: the Gaussian filter's leave-one-out conditionals log p(y_k | y_-k, theta), which make
-          ``az.loo`` right for dependent data;
+        - ``log_likelihood``: the Gaussian filter's leave-one-out conditionals, log p of each observed entry given all
+          other entries and theta, which make ``az.loo`` right for dependent data;
         - ``log_prior``: the log prior density of each parameter, for ``az.psense_summary``;
         - ``one_step_ahead``: log p(y_k | y_1:k-1, theta) and standardised residuals;
         - ``trajectories``: forces, states, deterministics and noise-free outputs at ``at``, given the data; from the
           Gaussian smoother, and for "pmmh" from the particle smoother. Where densities are known, mean and 95% interval
           of each (``forces_summary`` and so on) and of new data (``new_data_summary``);
-        - ``posterior_predictive``: replicated data along these trajectories. (``numpyro.infer.Predictive`` with the
-          same draws simulates NEW forces instead.) ArviZ's predictive checks take one output at these draws:
-          ``az.plot_ppc_pit(result.sel(output="a", draw=result["trajectories"]["draw"]))`` on ArviZ 1.x;
+        - ``posterior_predictive``: replicated data along a path of states and forces given the data, one for each draw.
+          (``numpyro.infer.Predictive`` with the same draws simulates NEW forces instead.)
         - ``predictions``: with ``at``, new observations at these times, with noise; see `forecast`;
-        - ``observed_data``, and ``truth`` and ``constant_data`` (known inputs) if there are any.
+        - ``observed_data``; ``data``, with dimensions time and output, NaN where missing; and ``truth`` and
+          ``constant_data`` (known inputs) if there are any.
+
+        ``observed_data``, ``log_likelihood`` and ``posterior_predictive`` have one dimension ``observation`` for all
+        observed entries, with the coordinates time, output and series, so that ``az.loo``, ``az.loo_pit`` and
+        ``az.plot_ppc_pit`` take the result as it is.
 
         With several likelihood sites ``log_likelihood``, ``observed_data`` and ``posterior_predictive`` have a variable
-        for each, with dimensions of its own (``a_time``, ``a_output``), and the groups ``one_step_ahead``,
+        for each, with a dimension of its own (``a_observation``), and the groups ``data``, ``one_step_ahead``,
         ``trajectories``, ``predictions``, ``truth`` and ``constant_data`` have its name: ``trajectories_a``.
         `lfm.select_site` returns the part of one site as a result of one site, for figures, scores and tables.
 

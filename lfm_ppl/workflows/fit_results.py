@@ -1,6 +1,6 @@
 """Post-processing of the draws of `lfm_ppl.fit`, and the result.
 
-1. Score the observations under every draw.
+1. Score the observations under every draw, and replicate them.
 2. Diagnose the likelihood: convergence of the sites, weights under constraints, resolution of the forces, and the error
    of the Gaussian approximation.
 3. Draw a trajectory for some draws of each chain.
@@ -167,7 +167,8 @@ def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint |
         score_keys = split_by_name(options.keys["scores"], problem.sites)
         for name, site in problem.sites.items():
             processed.scores[name] = best_effort(label("scores of the observations", name), partial(
-                scores, score_keys[name], site.bound, values, **batch_options(label("scores", name))), None)
+                scores, score_keys[name], site.bound, values, draws.particle_options.get("particle_settings"),
+                draws.particle_options.get("particle_steps"), **batch_options(label("scores", name))), None)
         processed.attributes = _site_attributes(problem, draws, values)
         processed.warnings += best_effort("comparison with the priors", partial(
             prior_conflicts, problem.bound, values), [])

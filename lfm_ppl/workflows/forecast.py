@@ -296,7 +296,7 @@ def _forecast(key: jax.Array, result: Any, problem: LikelihoodProblem, times: np
     if log_likelihood is not None and not bound.site.example.is_family:
         total = log_likelihood.reshape(chains, len(draw_index), -1).sum(axis=-1)
         rebuilding.check_likelihood(result, total, draw_index)
-    observed = arviz_data.group(result, "observed_data")
+    observed = arviz_data.group(result, "data")
     series = series_dimension(result)
     names = {str(name): observed[name].values.tolist() for name in ("output", series) if name in observed.coords}
     return {GROUP: predictions(bound, split, posterior["draw"].values[draw_index], times, names, series)}

@@ -97,7 +97,7 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: ArrayLike, y: ArrayLike,
         ...     warnings.simplefilter("ignore")
         ...     result = lfm.to_arviz(mcmc, model, times, y)
         >>> result["log_likelihood"]["y"].dims, result["log_likelihood"]["y"].shape
-        (('chain', 'draw', 'time'), (2, 50, 5))
+        (('chain', 'draw', 'observation'), (2, 50, 5))
     """
     if trajectory_draws != 0:
         checks.positive_integer("trajectory_draws", trajectory_draws)

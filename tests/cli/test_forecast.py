@@ -57,7 +57,7 @@ def test_predictions_are_replaced_only_with_overwrite(run, fitted):
 @pytest.mark.slow
 def test_a_forecast_of_a_partial_result_has_its_figure(run, fitted):
     result = arviz_data.load(fitted)
-    partial = arviz_data.build({name: arviz_data.group(result, name) for name in ("posterior", "observed_data")},
+    partial = arviz_data.build({name: arviz_data.group(result, name) for name in ("posterior", "data")},
                                {**arviz_data.attributes(result), "partial": "60 of 90 draws a chain"})
     arviz_data.save(partial, fitted / "posterior.nc", overwrite=True)
     status, out, err = run(f"forecast {fitted} --until 8")

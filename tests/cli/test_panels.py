@@ -58,7 +58,7 @@ def test_a_panel_is_fitted_checked_and_forecast(run, files):
     result = lfm.load(files / "fit")
     assert result["posterior"]["rate"].dims == ("chain", "draw", "patient")
     assert result["posterior"]["patient"].values.tolist() == ["Bo", "Ann"]
-    ann = lfm.select_series(result, "Ann")["observed_data"]
+    ann = lfm.select_series(result, "Ann")["data"]
     np.testing.assert_array_equal(ann["time"], [0.5, 2.0, 4.0])
     assert (files / "fit" / "report.html").is_file() and (files / "fit" / "fit.png").is_file()
     assert run("check fit --draws 8")[0] == 0

@@ -161,7 +161,7 @@ def test_a_second_data_set_compiles_nothing(sampler, model):
     with compilations() as compiled:
         result = compute(OTHER)
     assert compiled == []
-    np.testing.assert_array_equal(group(result, "observed_data")["y"].values, OTHER)
+    np.testing.assert_array_equal(group(result, "data")["y"].values, OTHER)
 
 
 @pytest.mark.slow

@@ -87,20 +87,23 @@ def by_time(rng):
     residual = rng.normal(size=(len(time), 3)) + 0.1 * rng.normal(size=(CHAINS, DRAWS, 1, 3))
     residual = np.where(np.isnan(y), np.nan, residual)
     density = -0.5 * (np.log(2 * np.pi) + np.nan_to_num(residual) ** 2).sum(-1)
-    noise_free = clean + 0.08 * rng.normal(size=(CHAINS, THINNED, 1, 3))
-    new = noise_free + 0.15 * rng.normal(size=(CHAINS, THINNED, *clean.shape))
+    noise_free = clean + 0.08 * rng.normal(size=(CHAINS, DRAWS, 1, 3))
+    new = noise_free + 0.15 * rng.normal(size=(CHAINS, DRAWS, *clean.shape))
+    terms = -0.5 * (np.log(2 * np.pi) + np.nan_to_num(residual) ** 2)
     output = {"output": list(GENES)}
+    seen = np.nonzero(~np.isnan(y))
+    entries = {"time": ("observation", time[seen[0]], {"units": "h"}),
+               "output": ("observation", np.array(GENES)[seen[1]])}
     return {
-        "observed_data": xr.Dataset(
+        "data": xr.Dataset(
             {"y": (("time", "output"), y, units_attribute(GENES, UNITS))}, coords={**when, **output}
         ),
+        "observed_data": xr.Dataset({"y": ("observation", y[seen])}, coords=entries),
         "posterior_predictive": xr.Dataset(
-            {"y": (("chain", "draw", "time", "output"), new)},
-            coords={**sample, "draw": np.arange(THINNED) * 2, **when, **output},
+            {"y": (("chain", "draw", "observation"), new[:, :, *seen])}, coords={**sample, **entries}
         ),
-        # az.loo on ArviZ 1.x fails where the terms of a time are all the same, as with no data.
-        "log_likelihood": xr.Dataset({"y": (("chain", "draw", "time"), density)}, coords={**sample, **when}).isel(
-            time=~np.isnan(y).all(axis=1)
+        "log_likelihood": xr.Dataset(
+            {"y": (("chain", "draw", "observation"), terms[:, :, *seen])}, coords={**sample, **entries}
         ),
         "one_step_ahead": xr.Dataset(
             {
@@ -225,7 +228,7 @@ def crowded():
     return arviz_data.build(
         {
             "posterior": posterior,
-            "observed_data": xr.Dataset({"y": (("time", "output"), y, units)}, coords=over),
+            "data": xr.Dataset({"y": (("time", "output"), y, units)}, coords=over),
             "trajectories": xr.Dataset(
                 {"outputs": ((*sample, "at", "output"), wave[1] + 1e-5 * rng.normal(size=(4, 25, 1, 15)))},
                 coords={"at": at, "output": names},

@@ -223,7 +223,7 @@ def test_ratios_of_a_linear_model_are_zero_up_to_the_noise_of_particles(linear):
 def test_particles_and_grid_agree(bent):
     result, exact = bent, check_accuracy(bent, well, draws=400, progress=False)
     copy = arviz_data.build({"posterior": arviz_data.group(result, "posterior"),
-                             "observed_data": arviz_data.group(result, "observed_data")},
+                             "data": arviz_data.group(result, "data")},
                             arviz_data.attributes(result))
     noisy = check_accuracy(copy, well, reference="particles", draws=400, particles=300, progress=False)
     np.testing.assert_array_equal(noisy.dataset["draw"], exact.dataset["draw"])
@@ -240,7 +240,7 @@ def test_particles_and_grid_agree(bent):
 def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     """Importance weights from draws of the wrong posterior against quadrature with the exact likelihood."""
     single_pass = approximate(well, iterations=0)
-    result = arviz_data.build({name: arviz_data.group(bent, name) for name in ("posterior", "observed_data")}, {})
+    result = arviz_data.build({name: arviz_data.group(bent, name) for name in ("posterior", "data")}, {})
     problem = rebuilding.problem(result, single_pass)
     nodes = np.linspace(0.15, 5.0, 60)
     posteriors = {}
@@ -257,7 +257,7 @@ def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     cumulative = np.cumsum(posteriors["wrong"][0]) - 0.5 * posteriors["wrong"][0]
     draws = np.interp(np.random.default_rng(0).uniform(size=(4, 100)), cumulative, nodes)
     replaced = arviz_data.build({"posterior": xr.Dataset({"depth": (("chain", "draw"), draws)}),
-                                 "observed_data": arviz_data.group(result, "observed_data")}, {"sampler": "nuts"})
+                                 "data": arviz_data.group(result, "data")}, {"sampler": "nuts"})
     report = check_accuracy(replaced, single_pass, draws=400, progress=False)
     row = report.table.loc["depth"]
     assert report.reliable
@@ -309,8 +309,10 @@ def test_correction_keeps_data_truth_and_the_layout_of_trajectories(checked):
     old, new = (arviz_data.group(one, "trajectories") for one in (result, corrected))
     assert new["states"].dims == old["states"].dims and new["states"].shape == (1, 6, *old["states"].shape[2:])
     np.testing.assert_array_equal(new["at"], old["at"])
-    assert arviz_data.group(corrected, "posterior_predictive")["y"].shape == (1, 6, 6, 1)
-    assert {"observed_data", "truth"} <= set(arviz_data.groups(corrected))
+    chains, draws = (arviz_data.group(corrected, "posterior").sizes[name] for name in ("chain", "draw"))
+    for name in ("log_likelihood", "posterior_predictive"):
+        assert arviz_data.group(corrected, name)["y"].shape[:2] == (chains, draws)
+    assert {"data", "truth"} <= set(arviz_data.groups(corrected))
     assert "states_summary" in new  # of the corrected draws, where the result has none
 
 
@@ -386,9 +388,9 @@ def test_mistakes(bent, changes, name):
 
 
 def test_mistakes_about_the_result(bent, linear):
-    posterior, observed = (arviz_data.group(bent, name) for name in ("posterior", "observed_data"))
+    posterior, observed = (arviz_data.group(bent, name) for name in ("posterior", "data"))
     for groups, attrs, model, name in (
-            ({}, {}, well, "observed_data"), ({"observed_data": observed}, {}, relaxation, "rate"),
+            ({}, {}, well, "data"), ({"data": observed}, {}, relaxation, "rate"),
             ({}, {"sampler": "pmmh"}, well, "pmmh"), ({}, {"sampler": "hmc"}, well, "hmc")):
         with pytest.raises(ValueError, match=name):
             check_accuracy(arviz_data.build({"posterior": posterior, **groups}, attrs), model)

@@ -88,7 +88,7 @@ def groups():
         "posterior": xr.Dataset({"decay": (("chain", "draw"), draws), "rate": (("chain", "draw"), new[..., 0, 0])},
                                 sample),
         "truth": xr.Dataset({"decay": 0.4375}),
-        "observed_data": xr.Dataset({"y": (("time", "output"), y, {"units": json.dumps({"x": "nM"})})},
+        "data": xr.Dataset({"y": (("time", "output"), y, {"units": json.dumps({"x": "nM"})})},
                                     {"time": ("time", np.arange(6.0), {"units": "h"}), **output}),
         "constant_data": xr.Dataset({"heater": ("heater_time", np.array([0.0, 7.5]),
                                                {"interpolation": "linear", "units": "kW"})},
@@ -145,7 +145,7 @@ def test_every_section_has_its_values(groups, attrs, tmp_path):
 def test_all_text_is_escaped(groups, attrs, tmp_path):
     groups["posterior"] = groups["posterior"].rename({"decay": "d<b>"})
     groups["accuracy"] = groups["accuracy"].assign_coords(parameter=[EVIL, "rate"])
-    for name in ("observed_data", "predictions"):
+    for name in ("data", "predictions"):
         groups[name] = groups[name].assign_coords(output=[EVIL, "z"])
     attrs |= dict.fromkeys(("model", "description", "data", "note", "command_line", "partial", "sampler", "own"), EVIL)
     page = read(save(groups, attrs, tmp_path / "a.html", more={EVIL: pd.DataFrame({EVIL: [EVIL]}, [EVIL])}))
@@ -161,13 +161,13 @@ def test_a_posterior_alone_and_a_call_in_python(groups, tmp_path):
 
 
 def test_dates_need_a_unit_of_time(groups, attrs, tmp_path):
-    del groups["observed_data"]["time"].attrs["units"]
+    del groups["data"]["time"].attrs["units"]
     page = read(save(groups, attrs, tmp_path / "a.html"))
     assert "0 to 5" in page.texts["data"] and "2024" not in page.texts["data"] + page.texts["forecast"]
 
 
 def test_a_panel(groups, attrs, tmp_path):
-    for name in ("observed_data", "predictions"):
+    for name in ("data", "predictions"):
         groups[name] = xr.concat([groups[name]] * 7, pd.Index([f"p{k}" for k in range(7)], name="series"),
                                  data_vars="all")
     page = read(save(groups, attrs, tmp_path / "a.html"))

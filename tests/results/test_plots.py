@@ -116,7 +116,7 @@ def test_names_are_whole():
 
 def test_fit_draws_data_means_and_quantiles(result, datasets):
     figure = plot_fit(result)
-    observed, outputs = datasets["observed_data"]["y"], datasets["trajectories"]["outputs"]
+    observed, outputs = datasets["data"]["y"], datasets["trajectories"]["outputs"]
     predictive = datasets["posterior_predictive"]["y"]
     assert figure.axes[0].get_ylabel() == "CDKN1A (a.u.)" and figure.axes[-1].get_xlabel() == "time (h)"
     assert legend_texts(figure) == {"data", "posterior mean", "95%, noise-free", "95%, new data", "missing"}
@@ -135,13 +135,16 @@ def test_fit_draws_data_means_and_quantiles(result, datasets):
             np.testing.assert_allclose(inner[x], [low, high])
         assert (min(outer), max(outer)) == (0.0, 12.0)
         for at in np.unique(time):  # replicates are pooled
-            new = predictive.values[:, :, time == at, index]
+            is_drawn = (predictive["time"] == at) & (predictive["output"] == observed["output"][index].item())
+            if not is_drawn.any():
+                continue
+            new = predictive.values[:, :, is_drawn.values]
             np.testing.assert_allclose(outer[at], np.quantile(new, [0.025, 0.975]))
 
 
 def test_band_of_new_data_keeps_to_the_values_that_the_family_has(datasets):
     predictive = datasets["posterior_predictive"]
-    counts = np.random.default_rng(0).poisson(0.5 + 4 * (predictive["time"].values[:, None] > 6), predictive["y"].shape)
+    counts = np.random.default_rng(0).poisson(0.5 + 4 * (predictive["time"].values > 6), predictive["y"].shape)
     for values, kind in ((counts, "whole"), (counts + 0.001 * predictive["y"] ** 2, "positive")):
         new = predictive.assign(y=(predictive["y"].dims, np.asarray(values, float)))
         axes = plot_fit(arviz_data.build({**datasets, "posterior_predictive": new})).axes[0]
@@ -152,7 +155,7 @@ def test_band_of_new_data_keeps_to_the_values_that_the_family_has(datasets):
 
 def test_fit_of_one_row_and_without_predictive_draws(datasets):
     del datasets["posterior_predictive"]
-    datasets["observed_data"] = datasets["observed_data"].isel(time=[0])
+    datasets["data"] = datasets["data"].isel(time=[0])
     figure = plot_fit(arviz_data.build(datasets), ["SESN1"])
     (axes,) = figure.axes
     assert len(bands(axes)) == 1 and len(the_line(axes, "data").get_xdata()) == 1
@@ -224,7 +227,7 @@ def test_forecasts_continue_mean_and_bands_as_curves_or_bars(datasets):
         axes = plot(arviz_data.build({**datasets, "predictions": ahead.isel(time=[0, -1])})).axes[0]
         bars = [collection for collection in axes.collections if isinstance(collection, LineCollection)]
         assert all(np.all(segment[:, 0] == 30.0) for bar in bars for segment in bar.get_segments()) and bars
-    alone = {name: datasets[name] for name in ("observed_data",)}
+    alone = {name: datasets[name] for name in ("data",)}
     axes = plot_fit(arviz_data.build({**alone, "predictions": ahead})).axes[0]
     np.testing.assert_array_equal(the_line(axes, "posterior mean").get_xdata(), time)
 
@@ -235,7 +238,7 @@ def test_a_short_forecast_shows_the_last_rows_and_held_out_data(datasets):
     datasets["trajectories"] = paths.sel(at=paths["at"] <= last)
     ahead = predictions(datasets, np.linspace(12.5, end, 5), last)
     y = xr.DataArray([[1.0, 2.0, 3.0], [1.5, np.nan, 2.5]], dims=("time", "output"))
-    held_out = xr.Dataset({"y": y}, {"time": [13.0, 13.5], "output": datasets["observed_data"]["output"]})
+    held_out = xr.Dataset({"y": y}, {"time": [13.0, 13.5], "output": datasets["data"]["output"]})
     result = arviz_data.build({**datasets, "predictions": ahead, "held_out_data": held_out})
     axes = plot_fit(result).axes[1]
     shown = the_line(axes, "data").get_xdata()
@@ -248,10 +251,10 @@ def test_a_short_forecast_shows_the_last_rows_and_held_out_data(datasets):
 
 
 def test_doses_are_marked_and_their_rows_are_not_missing(datasets):
-    y = datasets["observed_data"]["y"]
+    y = datasets["data"]["y"]
     times, empty = y["time"].values, y.copy()
     empty.values[[0, 3]] = np.nan
-    datasets["observed_data"] = datasets["observed_data"].assign(y=empty)
+    datasets["data"] = datasets["data"].assign(y=empty)
     dose = InputTable(times[[0, 2]], np.array([4.0, 2.0]), "dose:gut", np.array([0.0, 1e3]), None, times[[3]])
     heater = InputTable(times[[0, 3]], np.array([0.0, 2.0]))
     plain = plot_fit(arviz_data.build({**datasets, "constant_data": to_dataset({"heater": heater})})).axes[0]
@@ -267,7 +270,7 @@ def test_doses_are_marked_and_their_rows_are_not_missing(datasets):
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_curves_at_few_times_are_bars_and_lines(datasets, count):
     paths = datasets["trajectories"].isel(at=np.arange(count))
-    keep = {name: datasets[name] for name in ("observed_data", "posterior_predictive") if name in datasets}
+    keep = {name: datasets[name] for name in ("data", "observed_data", "posterior_predictive") if name in datasets}
     for plot in (plot_fit, plot_forces):
         axes = plot(arviz_data.build({**keep, "trajectories": paths})).axes[0]
         mean = the_line(axes, "posterior mean")
@@ -377,7 +380,7 @@ def test_residuals_of_every_second_row_few_or_no_observations(datasets, readable
     assert not recwarn.list
 
 
-@pytest.mark.parametrize("plot, group", [(plot_fit, "observed_data"), (plot_states, "trajectories"),
+@pytest.mark.parametrize("plot, group", [(plot_fit, "data"), (plot_states, "trajectories"),
                                          (plot_trace, "posterior"), (plot_residuals, "one_step_ahead")])
 def test_a_missing_group_is_named_with_its_source(datasets, plot, group):
     del datasets[group]

@@ -24,7 +24,7 @@ def result(tables, labels=(), origin=None):
                    {"time": ("time", np.arange(6.0), {"units": "h"}), "output": ["x"]})
     posterior = xr.Dataset({"rate": (("chain", "draw"), np.ones((1, 2)))})
     y = y.assign_coords(patient=list(labels)) if labels else y
-    return arviz_data.build({"posterior": posterior, "observed_data": y,
+    return arviz_data.build({"posterior": posterior, "data": y,
                              GROUP: to_dataset(tables)}, {} if origin is None else {"time_origin": origin})
 
 

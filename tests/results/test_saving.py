@@ -24,7 +24,7 @@ def test_every_figure_in_every_format(tmp_path, result):
 
 
 def test_figures_without_their_group_are_left_out(tmp_path, datasets):
-    kept = {name: datasets[name] for name in ("posterior", "observed_data")}
+    kept = {name: datasets[name] for name in ("posterior", "data")}
     paths = save_figures(arviz_data.build(kept), tmp_path, "png")
     assert [path.name for path in paths] == ["trace.png", "pairs.png"]
     kept["trajectories"] = datasets["trajectories"].drop_dims(["force", "output"])
@@ -32,7 +32,7 @@ def test_figures_without_their_group_are_left_out(tmp_path, datasets):
     paths = save_figures(arviz_data.build(kept), tmp_path, "png")
     assert [path.name for path in paths] == ["states.png"]
     assert matplotlib.image.imread(paths[0]).shape[1] == 7.0 * 300
-    only = arviz_data.build({"observed_data": xr.Dataset({"y": ("time", [1.0])})})
+    only = arviz_data.build({"data": xr.Dataset({"y": ("time", [1.0])})})
     assert save_figures(only, tmp_path) == []
 
 
@@ -58,8 +58,8 @@ def test_unknown_format(tmp_path, result):
 def test_long_lists_go_to_numbered_pages(tmp_path, crowded, monkeypatch):
     saving = import_module("lfm_ppl.results.plots.saving")
     trajectories = arviz_data.group(crowded, "trajectories")
-    data = arviz_data.group(crowded, "observed_data")
-    small = arviz_data.build({"trajectories": trajectories, "observed_data": data})
+    data = arviz_data.group(crowded, "data")
+    small = arviz_data.build({"trajectories": trajectories, "data": data})
     paths = save_figures(small, tmp_path, width="column")
     assert [path.name for path in paths] == ["fit-1.png", "fit-2.png"]
     monkeypatch.setattr(saving, "MAX_PAGES", 1)

@@ -19,11 +19,12 @@ def panel():
     times = (("subject", "time"), np.array([[0.0, 1.0, 1.0], [0.0, 2.0, 4.0]]), {"units": "h"})
     posterior = {"scale": (("chain", "draw", "subject"), np.arange(8.0).reshape(1, 4, 2)),
                  "shared": (("chain", "draw"), np.ones((1, 4)))}
-    scores = {"y": (("chain", "draw", "subject", "time"), np.arange(24.0).reshape(1, 4, 2, 3))}
+    scores = {"y": (("chain", "draw", "observation"), np.arange(16.0).reshape(1, 4, 4))}
+    entries = {"subject": ("observation", [7, 7, 9, 9]), "time": ("observation", [0.0, 1.0, 2.0, 4.0])}
     groups = {"posterior": xr.Dataset(posterior, sample),
-              "observed_data": xr.Dataset({"y": (("subject", "time", "output"), y)},
+              "data": xr.Dataset({"y": (("subject", "time", "output"), y)},
                                           {"subject": [7, 9], "output": ["x"], "times": times}),
-              "log_likelihood": xr.Dataset(scores, {**sample, "times": times}),
+              "log_likelihood": xr.Dataset(scores, {"chain": [0], "draw": np.arange(4), **entries}),
               "accuracy": xr.Dataset({"k": 1.0})}
     attrs = {"sampler": "map", arviz_data.MODE: json.dumps({"scale": [0.5, 1.5], "shared": 2.0}),
              arviz_data.DEGENERATE: json.dumps({"scale": [1]})}
@@ -32,13 +33,13 @@ def panel():
 
 def test_rows_scores_and_units(panel):
     view = lfm.select_series(panel, 7)
-    data = group(view, "observed_data")
+    data = group(view, "data")
     assert data["y"].dims == ("time", "output") and data["time"].attrs == {"units": "h"}
     np.testing.assert_array_equal(data["time"], [0.0, 1.0])
     np.testing.assert_array_equal(group(view, "log_likelihood")["y"][0, 0], [0.0, 1.0])
     other = lfm.select_series(panel, "9")
-    np.testing.assert_array_equal(group(other, "observed_data")["time"], [0.0, 2.0, 4.0])  # missing, and no padding
-    np.testing.assert_array_equal(group(other, "log_likelihood")["y"][0, 0], [4.0, 5.0])
+    np.testing.assert_array_equal(group(other, "data")["time"], [0.0, 2.0, 4.0])  # missing, and no padding
+    np.testing.assert_array_equal(group(other, "log_likelihood")["y"][0, 0], [2.0, 3.0])
     assert "accuracy" not in arviz_data.groups(view)
 
 

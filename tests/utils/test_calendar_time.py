@@ -169,8 +169,8 @@ def test_dates_as_times_are_fitted_as_a_table_of_dates():
     plain = lfm.fit(model, np.arange(6.0, 14.0), y, at=[15.0, 16.0], **OPTIONS)
     for result in (table, computed):
         assert result.attrs["time_origin"] == "2026-01-05T00:00:00"
-        assert result["observed_data"]["time"].attrs["units"] == "h"
-        for group, name in (("posterior", "rate"), ("predictions", "y"), ("observed_data", "time")):
+        assert result["data"]["time"].attrs["units"] == "h"
+        for group, name in (("posterior", "rate"), ("predictions", "y"), ("data", "time")):
             np.testing.assert_array_equal(result[group][name], plain[group][name])
     ahead = lfm.forecast(computed, model, later, draws=5, progress=False)
     expected = lfm.forecast(plain, model, [15.0, 16.0], draws=5, progress=False)
@@ -190,7 +190,7 @@ def test_dates_are_counted_in_the_unit_that_the_model_names():
     for data, at in (((hours, y), [13 / 24]), ((pd.DataFrame(y, hours, ["x"]),), hours[-1:]), ((in_hours,), [13.0]),
                      ((numbers,), [13.0])):
         result = lfm.fit(model, *data, at=at, model_kwargs={"unit": "d"}, **OPTIONS)
-        np.testing.assert_allclose(result["observed_data"]["time"], np.arange(6.0, 14.0) / 24, rtol=1e-15)
+        np.testing.assert_allclose(result["data"]["time"], np.arange(6.0, 14.0) / 24, rtol=1e-15)
         np.testing.assert_allclose(result["posterior"]["rate"], plain["posterior"]["rate"], rtol=1e-8)
         assert result["trajectories"]["at"].attrs["units"] == "d"
         np.testing.assert_allclose(result["trajectories"]["at"], [13 / 24], rtol=1e-15)

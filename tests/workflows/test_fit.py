@@ -65,10 +65,10 @@ def test_groups_and_dimensions(nuts):
     expected = {
         "posterior": {"decay": ("chain", "draw", "output"), "lengthscale": ("chain", "draw"),
                       "noise_sd": ("chain", "draw")},
-        "log_likelihood": {"y": ("chain", "draw", "time")},
+        "log_likelihood": {"y": ("chain", "draw", "observation")},
         "log_prior": {name: ("chain", "draw") for name in ("decay", "lengthscale", "noise_sd")},
         "one_step_ahead": {"log_density": ("chain", "draw", "time"), "residual": ("chain", "draw", "time", "output")},
-        "posterior_predictive": {"y": ("chain", "draw", "time", "output")},
+        "posterior_predictive": {"y": ("chain", "draw", "observation")},
         "trajectories": {"forces": ("chain", "draw", "at", "force"), "states": ("chain", "draw", "at", "state"),
                          "outputs": ("chain", "draw", "at", "output"),
                          "deterministics": ("chain", "draw", "at", "deterministic"),
@@ -81,7 +81,7 @@ def test_groups_and_dimensions(nuts):
                         "outputs": ("chain", "draw", "time", "output"), "forces": ("chain", "draw", "time", "force"),
                         "states": ("chain", "draw", "time", "state"),
                         "deterministics": ("chain", "draw", "time", "deterministic")},
-        "observed_data": {"y": ("time", "output")},
+        "data": {"y": ("time", "output")}, "observed_data": {"y": ("observation",)},
         "truth": {"forces": ("at_truth", "force"), "states": ("at_truth", "state"), "decay": ("output",),
                   "lengthscale": (), "noise_sd": (), "outputs": ("at_truth", "output"),
                   "deterministics": ("at_truth", "deterministic")},
@@ -93,16 +93,20 @@ def test_groups_and_dimensions(nuts):
 
 
 def test_coordinates_carry_names_times_and_units(nuts, known, y):
-    posterior, paths, observed = (group(nuts, name) for name in ("posterior", "trajectories", "observed_data"))
+    posterior, paths, observed = (group(nuts, name) for name in ("posterior", "trajectories", "data"))
     assert posterior["output"].values.tolist() == ["a", "b"]
     assert (paths["force"].values.tolist(), paths["state"].values.tolist()) == (["drive"], ["x0", "x1"])
     assert (posterior.sizes["draw"], paths.sizes["draw"]) == (40, 5)
     assert set(paths["draw"].values) <= set(posterior["draw"].values)
     np.testing.assert_array_equal(paths["at"], FORECAST)
     np.testing.assert_array_equal(observed["y"], y)
-    for name in ("observed_data", "log_likelihood", "one_step_ahead", "posterior_predictive"):
-        np.testing.assert_array_equal(group(nuts, name)["time"], TIMES)
+    rows, outputs = np.nonzero(np.isfinite(y))
+    for name, times in (("data", TIMES), ("one_step_ahead", TIMES), ("log_likelihood", TIMES[rows]),
+                        ("posterior_predictive", TIMES[rows]), ("observed_data", TIMES[rows])):
+        np.testing.assert_array_equal(group(nuts, name)["time"], times)
         assert group(nuts, name)["time"].attrs["units"] == "h"
+    assert group(nuts, "posterior_predictive")["output"].values.tolist() == np.array(["a", "b"])[outputs].tolist()
+    np.testing.assert_array_equal(group(nuts, "observed_data")["y"], y[rows, outputs])
     assert (paths["forces"].attrs["units"], observed["y"].attrs["units"]) == ("1/h", "nM")
     np.testing.assert_array_equal(group(nuts, "truth")["outputs"], np.ones((len(TIMES), 2)))  # the states themselves
     truth = group(known, "truth")
@@ -160,12 +164,14 @@ def test_conditionals_equal_the_exact_ones_at_every_draw(nuts, y):
         theta = {name: posterior[name].values[chain, draw] for name in motif.THETA}
         whole = motif.log_density(y, **theta)
         np.testing.assert_allclose(ahead.values[chain, draw].sum(), whole, rtol=1e-8)
-        for row in range(len(TIMES)):
-            without, before = y.copy(), y.copy()
-            without[row] = np.nan
-            before[row:] = np.nan
+        for index, entry in enumerate(zip(*np.nonzero(np.isfinite(y)), strict=True)):
+            without = y.copy()
+            without[entry] = np.nan
             exact = whole - motif.log_density(without, **theta)
-            np.testing.assert_allclose(conditional.values[chain, draw, row], exact, rtol=1e-8, atol=1e-9)
+            np.testing.assert_allclose(conditional.values[chain, draw, index], exact, rtol=1e-8, atol=1e-9)
+        for row in range(len(TIMES)):
+            before = y.copy()
+            before[row:] = np.nan
             until = y.copy()
             until[row + 1 :] = np.nan
             step = motif.log_density(until, **theta) - motif.log_density(before, **theta)
@@ -207,11 +213,12 @@ def test_loo_equals_refitting_without_each_observation(line, y, density):
     def evidence(y):
         return np.log(np.diff(nodes)[0]) + np.logaddexp.reduce(prior + log_likelihood(y))
 
-    exact = np.empty(len(TIMES))
-    for row in range(len(TIMES)):
+    entries = list(zip(*np.nonzero(np.isfinite(y)), strict=True))
+    exact = np.empty(len(entries))
+    for index, entry in enumerate(entries):
         without = y.copy()
-        without[row] = np.nan
-        exact[row] = evidence(y) - evidence(without)
+        without[entry] = np.nan
+        exact[index] = evidence(y) - evidence(without)
     import arviz as az
 
     result = az.loo(line, pointwise=True)
@@ -280,12 +287,12 @@ def test_trajectories_have_the_exact_joint_distribution(known, exact):
     np.testing.assert_allclose(ahead["y_mean"].values[0, 0].ravel(), mean[at], atol=2e-6)
 
 
-def test_posterior_predictive_is_the_smoothed_state_and_noise(known, exact):
+def test_posterior_predictive_is_the_smoothed_state_and_noise(known, exact, y):
     replicated = group(known, "posterior_predictive")["y"].values[0]
     mean, covariance = exact
-    size = 2 * len(TIMES)
-    noise = motif.THETA["noise_sd"] ** 2 * np.eye(size)
-    assert_moments(replicated.reshape(len(replicated), -1), mean[:size], covariance[:size, :size] + noise)
+    seen = np.flatnonzero(np.isfinite(y))
+    noise = motif.THETA["noise_sd"] ** 2 * np.eye(len(seen))
+    assert_moments(replicated, mean[seen], covariance[np.ix_(seen, seen)] + noise)
 
 
 def test_bands_are_the_quantiles_of_the_mixture_over_the_draws(nuts, y):
@@ -361,12 +368,12 @@ def test_panel():
                        at=[0.0, 2.0], chain_method="vectorized", sampler_options={"adapt": "throughout"})
     sizes = {name: dict(group(result, name).sizes) for name in arviz_data.groups(result)}
     assert sizes["posterior"] == {"chain": 2, "draw": 10, "series": 2}
-    assert sizes["log_likelihood"] == {"chain": 2, "draw": 10, "series": 2, "time": 4}
+    assert sizes["log_likelihood"] == {"chain": 2, "draw": 10, "observation": 7}
     assert sizes["one_step_ahead"] == {"chain": 2, "draw": 10, "series": 2, "time": 4, "output": 1}
-    assert sizes["posterior_predictive"] == {"chain": 2, "draw": 2, "series": 2, "time": 4, "output": 1}
+    assert sizes["posterior_predictive"] == {"chain": 2, "draw": 10, "observation": 7}
     assert sizes["trajectories"] == {"chain": 2, "draw": 2, "series": 2, "at": 2, "force": 1, "state": 1, "output": 1,
                                      "deterministic": 1, "statistic": 3}
-    assert sizes["observed_data"] == {"series": 2, "time": 4, "output": 1}
+    assert sizes["data"] == {"series": 2, "time": 4, "output": 1} and sizes["observed_data"] == {"observation": 7}
     posterior, ahead = group(result, "posterior"), group(result, "one_step_ahead")["log_density"].values
     for series in range(2):
         theta = (posterior["decay"].values[1, 9, series, None], 1.5, posterior["noise_sd"].values[1, 9])

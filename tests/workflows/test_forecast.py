@@ -225,7 +225,7 @@ def test_later_events_follow_those_of_the_fit():
     rate = np.array([[[0.4], [0.6]]])
     observed = xr.Dataset({"y": (("time", "output"), [[1.0], [0.5]])}, {"time": [1.0, 2.0], "output": ["drug"]})
     result = arviz_data.build({
-        "posterior": xr.Dataset({"rate": (("chain", "draw"), rate[..., 0])}), "observed_data": observed,
+        "posterior": xr.Dataset({"rate": (("chain", "draw"), rate[..., 0])}), "data": observed,
         "constant_data": to_dataset({"AMT": InputTable(np.array([0.0]), np.array([2.0]), "dose:drug")})})
     both = 2 * np.exp(-5 * rate) + 3 * np.exp(-2 * rate)
     doses = [lfm.Reset([2.5], "drug"), lfm.Dose([3.0], 3.0, "drug")]
@@ -262,7 +262,7 @@ def test_noise_of_rows_is_continued_or_constant(lead):
     y, rows = rng.normal(size=(*lead, 4, 1)), rng.uniform(0.1, 1.0, (*lead, 4, 1, 1))
     posterior = xr.Dataset({"decay": (("chain", "draw"), np.full((1, 3), 0.7))})
     dims = ("series",) * len(lead)
-    result = arviz_data.build({"posterior": posterior, "observed_data": xr.Dataset(
+    result = arviz_data.build({"posterior": posterior, "data": xr.Dataset(
         {"y": ((*dims, "time", "output"), y)}, {"time": times, "output": ["a"]})})
     later = rng.uniform(0.1, 1.0, (*lead, 2, 1, 1))
 

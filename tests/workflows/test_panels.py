@@ -47,17 +47,20 @@ def smoothed(series, times):
 
 
 def test_the_plate_is_a_dimension_of_every_group(result):
-    for name in ("posterior", "observed_data", "log_likelihood", "one_step_ahead", "trajectories",
-                 "posterior_predictive"):
+    for name in ("posterior", "data", "one_step_ahead", "trajectories"):
         assert group(result, name)["patient"].values.tolist() == LABELS, name
-    assert group(result, "observed_data")["times"].dims == ("patient", "time")
+    series, rows, _ = np.nonzero(np.isfinite(Y))
+    for name in ("observed_data", "log_likelihood", "posterior_predictive"):
+        np.testing.assert_array_equal(group(result, name)["patient"], np.array(LABELS)[series])
+        np.testing.assert_array_equal(group(result, name)["time"], TIMES[series, rows])
+    assert group(result, "data")["times"].dims == ("patient", "time")
     assert group(result, "trajectories")["times"].dims == ("patient", "at")
 
 
 @pytest.mark.parametrize("series", [0, 1])
 def test_a_selected_series_is_smoothed_as_if_alone(result, series):
     view = lfm.select_series(result, LABELS[series])
-    observed, paths = group(view, "observed_data"), group(view, "trajectories")
+    observed, paths = group(view, "data"), group(view, "trajectories")
     rows = np.isfinite(Y[series, :, 0])
     np.testing.assert_array_equal(observed["time"], TIMES[series, rows])
     np.testing.assert_array_equal(observed["y"], Y[series, rows])
@@ -118,7 +121,7 @@ def test_a_nonlinear_forecast_follows_the_dynamics(result):
                 jnp.array([1.0, 2.0]), times, steps=20), obs=y)
 
     draws = xr.Dataset({"scale": (("chain", "draw"), np.ones((1, 2)))})
-    result = arviz_data.build({"posterior": draws, "observed_data": group(result, "observed_data")})
+    result = arviz_data.build({"posterior": draws, "data": group(result, "data")})
     times = np.array([[1.5, 5.0, 9.0], [0.2, 3.5, 4.0]])
     states = group(lfm.forecast(result, cubic, times, progress=False), "predictions")["states"]
     exact = (np.array([[1.0], [2.0]]) ** -2 + 2 * times) ** -0.5

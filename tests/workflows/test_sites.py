@@ -88,12 +88,14 @@ def test_a_sampler_of_one_site_says_so():
 
 def test_groups_by_site(fitted):
     observed = arviz_data.group(fitted, "observed_data")
-    assert observed["a"].dims == ("a_time", "a_output") and observed["b"].dims == ("b_time", "b_output")
-    assert observed["a_output"].values.tolist() == ["level"]
+    assert observed["a"].dims == ("a_observation",) and observed["b"].dims == ("b_observation",)
+    assert set(observed["a_output"].values) == {"level"}
     for name in Y:
-        np.testing.assert_array_equal(observed[name], Y[name])
-        assert arviz_data.group(fitted, "log_likelihood")[name].shape == (1, 40, len(TIMES[name]))
-        assert arviz_data.group(fitted, "posterior_predictive")[name].shape == (1, 20, *Y[name].shape)
+        np.testing.assert_array_equal(observed[name], Y[name][np.isfinite(Y[name])])
+        np.testing.assert_array_equal(arviz_data.group(fitted, f"data_{name}")[name], Y[name])
+        count = np.isfinite(Y[name]).sum()
+        for label in ("log_likelihood", "posterior_predictive"):
+            assert arviz_data.group(fitted, label)[name].shape == (1, 40, count)
         terms = arviz_data.group(fitted, f"one_step_ahead_{name}")["log_density"]
         rates = arviz_data.group(fitted, "posterior")["rate"].values.ravel()
         expected = [likelihood(name, rate, TIMES[name]).log_prob(Y[name]) for rate in rates[:3]]
@@ -107,10 +109,12 @@ def test_a_selected_site_is_a_result_of_one_site(fitted, tmp_path):
     lfm.save(fitted, tmp_path / "fit.nc")
     for result in (fitted, lfm.load(tmp_path / "fit.nc")):
         site = lfm.select_site(result, "b")
-        assert set(arviz_data.groups(site)) == {"posterior", "log_prior", "observed_data", "log_likelihood",
+        assert set(arviz_data.groups(site)) == {"posterior", "log_prior", "data", "observed_data", "log_likelihood",
                                                 "one_step_ahead", "trajectories", "posterior_predictive",
-                                                "predictions", "other_sites"}
-        assert arviz_data.group(site, "observed_data")["y"].dims == ("time", "output")
+                                                 "predictions", "data_a"}
+        assert arviz_data.group(site, "data")["y"].dims == ("time", "output")
+        np.testing.assert_array_equal(arviz_data.group(site, "log_likelihood")["time"],
+                                      arviz_data.group(site, "observed_data")["time"])
         assert arviz_data.group(site, "predictions")["y"].sizes["time"] == 2
         assert arviz_data.attributes(site)["likelihood"].startswith("exact")
         assert lfm.plot_fit(site) is not None
@@ -155,7 +159,7 @@ def test_paths_of_a_site_are_those_of_its_model_alone():
         trajectories(jax.random.key(1), bound, {"rate": np.array([0.3, 0.5])}, at)
         for bound in (lfm.bind(two, times, y).site_models["b"], lfm.bind(alone, times["b"], y["b"])))
     assert paths["state"].shape == (2, 4, 1)
-    for name in ("state", "force", "output", "y", "log_likelihood"):
+    for name in ("state", "force", "output", "prediction", "log_likelihood"):
         np.testing.assert_allclose(paths[name], expected[name], atol=1e-9)
 
 

@@ -271,21 +271,33 @@ def _final_sites(terms: FamilyTerms, fixed_point: FixedPoint, uses_moments: bool
 def leave_one_out(predictor: SmoothedPredictor, sites: Sites, entries: jax.Array) -> jax.Array:
     """Return log p(y_k | all other rows), (T,), from the predictor that is smoothed with the converged sites.
 
-    It is the integral of a row's sites under the predictor N(m, F) without them, plus the terms of its entries. With
-    V = F (I + T F)^-1 and m smoothed, F = V (I - T V)^-1.
+    It is the integral of a row's sites under the predictor without them, plus the terms of its entries.
 
     Args:
         predictor: smoothed, (T, ...).
         sites: (T, D) each.
         entries: (T, D), of `log_evidence_terms`.
     """
+    return jax.vmap(_integral_of_sites)(predictor.mean, predictor.covariance, sites) + entries.sum(1)
 
-    def row(mean: jax.Array, covariance: jax.Array, sites: Sites) -> jax.Array:
-        # log|I + T F| = -log|I - T V|; and with a = m - c the exponent is that of the smoothed moments.
-        i_tv, log_det = inverse_and_log_det(jnp.eye(mean.shape[0]) - sites.tau[:, None] * covariance)
-        offset = matvec(i_tv.T, mean - sites.centre - matmul(covariance, sites.nu[:, None])[:, 0])
-        slope = sites.nu - sites.tau * offset
-        return (((sites.nu - 0.5 * sites.tau * offset) * offset).sum() + 0.5 * log_det
-                + 0.5 * (slope * matvec(covariance, slope)).sum())
 
-    return jax.vmap(row)(predictor.mean, predictor.covariance, sites) + entries.sum(1)
+def entry_leave_one_out(predictor: SmoothedPredictor, sites: Sites, entries: jax.Array) -> jax.Array:
+    """Return log p of each entry given all other entries (T, D), with the arguments of `leave_one_out`."""
+
+    def entry(mean: jax.Array, variance: jax.Array, site: Sites) -> jax.Array:
+        return _integral_of_sites(mean[None], variance[None, None], jax.tree.map(lambda a: a[None], site))
+
+    return jax.vmap(jax.vmap(entry))(predictor.mean, diagonal(predictor.covariance), sites) + entries
+
+
+def _integral_of_sites(mean: jax.Array, covariance: jax.Array, sites: Sites) -> jax.Array:
+    """Return the log integral of sites (D,) under the predictor N(m, F) without them.
+
+    With V = F (I + T F)^-1 and m smoothed, F = V (I - T V)^-1. ``mean`` (D,) and ``covariance`` V (D, D) are smoothed.
+    """
+    # log|I + T F| = -log|I - T V|; and with a = m - c the exponent is that of the smoothed moments.
+    i_tv, log_det = inverse_and_log_det(jnp.eye(mean.shape[0]) - sites.tau[:, None] * covariance)
+    offset = matvec(i_tv.T, mean - sites.centre - matmul(covariance, sites.nu[:, None])[:, 0])
+    slope = sites.nu - sites.tau * offset
+    return (((sites.nu - 0.5 * sites.tau * offset) * offset).sum() + 0.5 * log_det
+            + 0.5 * (slope * matvec(covariance, slope)).sum())

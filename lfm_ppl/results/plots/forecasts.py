@@ -20,7 +20,7 @@ from lfm_ppl.results.inputs import FORECAST
 from lfm_ppl.results.inputs import GROUP as CONSTANT
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, INTERVAL, MEAN, interval, noise_free_interval
-from lfm_ppl.results.series import times_of
+from lfm_ppl.results.series import ENTRY, times_of
 
 NOISE_FREE, PREDICTIVE = "#8FBFDE", "#D3E4F1"
 """Tints of blue: bands of noise-free outputs and of new data."""
@@ -67,10 +67,10 @@ def without_forecast(result: Any) -> Any:
 
 def forecast_window(result: Any) -> tuple[float, float] | None:
     """Return the interval of time to show of a result with a forecast; None: everything."""
-    if not is_made_later(result) or not has_group(result, "observed_data"):
+    if not is_made_later(result) or not has_group(result, "data"):
         return None
     last, end = forecast_span(result)
-    times = group(result, "observed_data")["time"].values
+    times = group(result, "data")["time"].values
     start = min(last - 2.0 * (end - last), times[-_FEWEST_ROWS:][0])
     if has_group(result, "trajectories"):
         start = min(start, group(result, "trajectories")["at"].values[-_FEWEST_ROWS:][0])
@@ -82,7 +82,7 @@ def recent_part(result: Any) -> tuple[Any, str]:
     window = forecast_window(result)
     if window is None:
         return result, ""
-    times = group(result, "observed_data")["time"].values
+    times = group(result, "data")["time"].values
     groups = {}
     for name in arviz_data.groups(result):
         groups[name] = group(result, name)
@@ -90,6 +90,8 @@ def recent_part(result: Any) -> tuple[Any, str]:
         clocks = [clock for clock in groups[name].dims if clock in ("time", "at", "at_truth") or
                   name in (CONSTANT, FORECAST) and str(clock).endswith(("_time", "_reset"))]
         groups[name] = groups[name].isel({clock: groups[name][clock].values >= window[0] for clock in clocks})
+        if ENTRY in groups[name].dims:
+            groups[name] = groups[name].isel({ENTRY: groups[name]["time"].values >= window[0]})
     remark = f"The last {(times >= window[0]).sum()} of {len(times)} rows of data and the forecast."
     return arviz_data.build(groups, arviz_data.attributes(result)), remark
 

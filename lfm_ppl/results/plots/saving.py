@@ -90,7 +90,7 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, Any]]
         for kind, draw in _OVER_TIME.items():
             names = (list(inputs_of(result)) if kind == "inputs" else
                      trajectories.trajectory_names(result, "output" if kind == "fit" else kind.removesuffix("s")))
-            if kind == "fit" and not has_group(result, "observed_data"):
+            if kind == "fit" and not has_group(result, "data"):
                 continue
             title = f"{prefix}{kind}".replace("forecast-fit", "forecast")
             draw = draw if prefix or not later else _of_the_fit(draw)

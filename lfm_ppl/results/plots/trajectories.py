@@ -23,7 +23,7 @@ from lfm_ppl.results.inputs import FORECAST, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import forecasts, style
 from lfm_ppl.results.predictions import INTERVAL, PERIODS, REGIMES, SHOWN_PERIODS, quantiles, repeats_often
 from lfm_ppl.results.scalars import unit_of
-from lfm_ppl.results.series import select_series, series_dimension, series_labels
+from lfm_ppl.results.series import ENTRY, select_series, series_dimension, series_labels
 from lfm_ppl.utils.checks import one_of
 
 MAX_PANELS = 12
@@ -49,7 +49,7 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any =
     quantity may be negative; observe its logarithm, or use an observation family of positive values.
 
     Args:
-        result: with the groups observed_data and trajectories, posterior_predictive for the outer band, predictions for
+        result: with the groups data and trajectories, posterior_predictive for the outer band, predictions for
             forecasts, which alone are drawn of a result without trajectories, such as a partial one, held_out_data that
             these were compared with, and truth where it is known.
         outputs: names; None for all, up to 12.
@@ -71,12 +71,12 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any =
         >>> data = xr.Dataset({"y": (("time", "output"), np.ones((10, 1)), {"units": "nM"})})
         >>> mean = mean.assign_coords({"at": time, "output": ["mRNA"]})
         >>> data = data.assign_coords({"time": time, "output": ["mRNA"]})
-        >>> figure = plot_fit(build({"trajectories": mean, "observed_data": data}))
+        >>> figure = plot_fit(build({"trajectories": mean, "data": data}))
         >>> figure.axes[0].get_ylabel()
         'mRNA (nM)'
     """
     refuse_several_sites(result)
-    observed = group(result, "observed_data")["y"]
+    observed = group(result, "data")["y"]
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
     parts, remark = recent_series(result, series, len(names))
     figure, panels = style.small_multiples(width, len(parts) * len(names), 1.35)
@@ -362,7 +362,8 @@ def _draw_new_data(axes: Axes, result: Any, name: str, predicted: xr.Dataset | N
     elif predicted is not None:
         band = forecasts.new_data_band(predicted)
     elif has_group(result, "posterior_predictive"):
-        draws = group(result, "posterior_predictive")["y"].sel(output=name).transpose("chain", "draw", "time")
+        draws = group(result, "posterior_predictive")["y"].transpose("chain", "draw", ENTRY)
+        draws = draws.isel({ENTRY: draws["output"].values == name})
         band, step = _band_of_draws(draws, *inner)
     else:
         return inner[1][-1], inner[2][-1]
@@ -381,7 +382,7 @@ def _band_of_draws(predictive: xr.DataArray, positions: np.ndarray, low: np.ndar
     draws, so that the band of a positive quantity stays positive.
     """
     measured, which = np.unique(predictive["time"].values, return_inverse=True)
-    draws = predictive.values.reshape(-1, predictive.sizes["time"])
+    draws = predictive.values.reshape(-1, predictive.sizes[ENTRY])
     bounds = np.array([quantiles(draws[:, which == k].ravel(), INTERVAL) for k in range(len(measured))])
     if np.all(draws == np.round(draws)):
         return (measured, bounds[:, 0], bounds[:, 1]), "mid"
@@ -415,7 +416,7 @@ def _draw_data(axes: Axes, result: Any, name: str) -> None:
 
     Rows of a data file that hold a dose or a reset and no measurement are not missing.
     """
-    observed = group(result, "observed_data")["y"]
+    observed = group(result, "data")["y"]
     times, values = observed["time"].values, observed.sel(output=name).values
     event_times = [np.append(table.times, [] if table.resets is None else table.resets)
                    for table in inputs_of(result).values() if table.is_dose]
