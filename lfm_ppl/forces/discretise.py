@@ -94,7 +94,7 @@ def discretise_steps(
 
     Args:
         feedback: ``F`` of shape (n, n), in 1/time.
-        diffusion: ``D`` of shape (n, n), symmetric positive semi-definite; None: no noise, whose integrals are left out.
+        diffusion: ``D`` of shape (n, n), symmetric positive semi-definite; None: no noise.
         dt: lengths of the steps, (B,).
         max_doublings: as in `discretise`.
 
