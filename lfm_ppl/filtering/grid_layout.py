@@ -85,10 +85,13 @@ class GridLayout(NamedTuple):
 
 
 def _padded_lengths(count: int, intervals: int) -> int:
-    """Return the size of a table of interval lengths: of irregular times, or where the table is small."""
-    if 4 * count > intervals:
+    """Return the size of a table of interval lengths: of irregular times, or where the table is small.
+
+    Larger tables grow by at most a third, so that the default trajectory times of similar series share a program.
+    """
+    if count > 16 or 4 * count > intervals:
         return min(padded_size(count), intervals)
-    size = padded_size(count) if count > 16 else 2 ** (count - 1).bit_length()
+    size = 2 ** (count - 1).bit_length()
     return size if 8 * size <= intervals else count
 
 

@@ -198,9 +198,11 @@ def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPar
     lin = feedback(ssm, linear)
     dispersion = ssm.model.process_noise
     is_constant = dispersion is not None and not callable(dispersion)
-    diffusion = jax.scipy.linalg.block_diag(
-        matmul(dispersion, dispersion.T) if is_constant else jnp.zeros((size, size)),
-        matmul(ssm.stack.dispersion(), ssm.stack.dispersion().T), jnp.zeros((1, 1)))
+    diffusion = None
+    if is_constant or ssm.force_dim or not is_block:
+        diffusion = jax.scipy.linalg.block_diag(
+            matmul(dispersion, dispersion.T) if is_constant else jnp.zeros((size, size)),
+            matmul(ssm.stack.dispersion(), ssm.stack.dispersion().T), jnp.zeros((1, 1)))
     # One more state that is constantly one carries the offset.
     augmented = jnp.zeros((total + 1, total + 1)).at[:total, :total].set(lin).at[:total, total].set(constant)
     phi, process_cov = discretise_joint(augmented, diffusion, length)

@@ -281,7 +281,7 @@ class BoundModel:
 
         def minus(z: Any) -> tuple[Any, Any]:
             value, gradient = density_and_gradient(jnp.asarray(z, float), self.model_data)
-            return -value, -gradient
+            return -np.asarray(value), -np.asarray(gradient)  # no further programs
 
         if not exact_hessian:
             return Objective(minus)

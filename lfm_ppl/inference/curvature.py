@@ -40,6 +40,13 @@ class Curvature:
         return self.vectors / np.sqrt(np.maximum(self.values, self.floor)) / self.root[:, None]
 
     @property
+    def start_covariance(self) -> np.ndarray:
+        """The inverse (d, d), with variance one of the coordinates along each flat direction, of no known scale."""
+        columns = self.vectors / self.root[:, None]
+        variances = np.where(self.flat, 1.0 / (columns**2).sum(axis=0), 1.0 / np.maximum(self.values, self.floor))
+        return (columns * variances) @ columns.T
+
+    @property
     def log_determinant(self) -> float:
         """Log determinant of the floored matrix."""
         floored = np.maximum(self.values, self.floor)

@@ -1,8 +1,9 @@
 """Starting points and mass matrix of NUTS from a Laplace approximation of the posterior.
 
 1. The mode is searched from the prior median and from prior draws (`lfm_ppl.inference.map.mode_of`).
-2. The Laplace approximation N(mode, C) is usable where the search converged, the Hessian is positive definite, and no
-   other start ended in a second mode of similar height.
+2. The Laplace approximation N(mode, C) is usable where the search converged, the Hessian is positive semi-definite, and
+   no other start ended in a second mode of similar height. Along directions in which the density is flat at the mode,
+   C has variance one, as a mass matrix without an approximation.
 3. Each chain starts at a draw of the approximation widened to `_WIDENING` standard deviations, so that the chains are
    overdispersed, which R-hat requires. Draws far outside of the posterior, as beyond the edge of a skewed posterior,
    are pulled towards the mode.
@@ -44,7 +45,7 @@ class Laplace(eqx.Module):
 
     Attributes:
         mode: (d,).
-        covariance: (d, d), the inverse Hessian of minus the log density at the mode.
+        covariance: (d, d), the inverse Hessian of minus the log density at the mode, one along flat directions.
     """
 
     mode: np.ndarray
@@ -63,7 +64,7 @@ def laplace_approximation(key: jax.Array, bound: BoundModel) -> Laplace:
         bound: the model and its data.
 
     Raises:
-        UnusableModeError: the search did not converge, the Hessian is not positive definite, or there are several
+        UnusableModeError: the search did not converge, the Hessian has a negative eigenvalue, or there are several
             modes of similar height.
         ValueError: no prior draw has a finite density.
     """
@@ -73,15 +74,13 @@ def laplace_approximation(key: jax.Array, bound: BoundModel) -> Laplace:
         # The same conditions raise below, with a remedy that fits here.
         warnings.simplefilter("ignore")
         result = mode_of(key, bound)
-    if result.unidentified:
-        raise UnusableModeError(f"the posterior is flat at its mode along {', '.join(result.unidentified)}")
     if not np.all(np.isfinite(result.covariance)):
         raise UnusableModeError("the Hessian at the posterior mode is not finite")
     if not result.converged:
         raise UnusableModeError(f"the search of the posterior mode did not converge: {result.message.rstrip('.')}")
     if _has_second_mode(result):
         raise UnusableModeError("the posterior has several modes of similar height")
-    return Laplace(result.mode, result.covariance)
+    return Laplace(result.mode, result.start_covariance)
 
 
 def _has_second_mode(result: MAPResult) -> bool:

@@ -27,6 +27,7 @@ from lfm_ppl.inference.bind import bind_arguments
 from lfm_ppl.inference.bound_model import BoundModel, StartError
 from lfm_ppl.inference.optimise import End, Minimum, Objective, newton, quasi_newton
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.random_keys import split_keys
 
 _HESSIANS = ("autodiff", "finite-differences")
 _ATTEMPTS = 20
@@ -50,6 +51,7 @@ class MAPResult:
         coordinates: names of the entries of ``mode``, in flat order: sites sorted by name, each in C order.
         covariance: inverse Hessian of minus the log density at the mode, (d, d), unconstrained, in
             flat order; positive definite; NaN where no finite Hessian exists.
+        start_covariance: the same with variance one along flat directions, for a sampler's first mass matrix, (d, d).
         log_density: log joint density at the mode: of the unconstrained parameters (with the
             Jacobian), or of the constrained ones with ``jacobian=False``.
         log_evidence: Laplace approximation of the log marginal likelihood; exact if the posterior
@@ -70,6 +72,7 @@ class MAPResult:
     mode: np.ndarray
     coordinates: tuple[str, ...]
     covariance: np.ndarray
+    start_covariance: np.ndarray
     log_density: float
     log_evidence: float
     converged: bool
@@ -101,7 +104,7 @@ class MAPResult:
                 "there is no Laplace approximation to draw from: the Hessian at the mode is not "
                 "finite. Use hessian='finite-differences', or sample the posterior with MCMC."
             )
-        noise = jax.random.normal(key, (n, self.mode.size))
+        noise = np.asarray(jax.random.normal(key, (n, self.mode.size)))
         return self._constrain(self.mode + noise @ self._factor.T)
 
 
@@ -204,14 +207,15 @@ def _starts(
     check_sites(model, init)
     if isinstance(init, Mapping):
         first, attempts = partial(_init_to_values, init), 1
-    first_key, *keys = jax.random.split(key, restarts)
-    start = _possible_start(model, value, first_key, first, attempts)
+    keys = split_keys(key, restarts)
+    start = _possible_start(model, value, keys(0), first, attempts)
     if isinstance(init, Mapping) and start is None:
         raise ValueError(
             f"the density is zero or not finite at init={dict(init)!r}. Give values inside the "
             "support of their priors at which the model can produce the data."
         )
-    starts = [start, *(_possible_start(model, value, k, init_to_sample, _ATTEMPTS) for k in keys)]
+    starts = [start, *(_possible_start(model, value, keys(index), init_to_sample, _ATTEMPTS)
+                       for index in range(1, restarts))]
     if all(start is None for start in starts):
         raise StartError(
             f"found no point of finite density in {restarts} x {_ATTEMPTS} draws from the prior. "
@@ -231,8 +235,9 @@ def check_sites(model: BoundModel, init: Any) -> None:
 def _possible_start(
     model: BoundModel, value: Callable, key: jax.Array, strategy: Callable, attempts: int
 ) -> np.ndarray | None:
-    for attempt in jax.random.split(key, attempts):
-        flat = model.draw(attempt, strategy)
+    keys = split_keys(key, attempts)
+    for attempt in range(attempts):
+        flat = model.draw(keys(attempt), strategy)
         if np.isfinite(value(flat)):
             return flat
     return None
@@ -258,7 +263,9 @@ def _result(
     unconstrained = {k: np.asarray(v) for k, v in bound.unravel(point).items()}
     values = {k: np.asarray(v) for k, v in bound.constrain(point).items()}
     factor, log_determinant, unidentified = np.full((point.size,) * 2, np.nan), math.nan, ()
+    start_covariance = factor
     if curvature is not None:
+        start_covariance = curvature.start_covariance
         factor, log_determinant = curvature.factor, curvature.log_determinant
         unidentified = tuple(names[i] for i in curvature.coordinates(curvature.flat))
     message = _verdict(minimum, names)
@@ -280,6 +287,7 @@ def _result(
         mode=point,
         coordinates=names,
         covariance=factor @ factor.T,
+        start_covariance=start_covariance,
         log_density=-minimum.value,
         log_evidence=-energy + 0.5 * (point.size * math.log(2 * math.pi) - log_determinant),
         converged=not message,

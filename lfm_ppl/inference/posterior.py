@@ -164,7 +164,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
     count = None if requested_times is None else requested_times.shape[-1]
     if requested_times is not None and is_shared and not is_forecast:
         # Repetitions of the last time, so that similar times share a program; their results are removed below.
-        extra = padded_size(requested_times.size + bound.times.size) - requested_times.size - bound.times.size
+        extra = padded_size(requested_times.size) - requested_times.size
         requested_times = np.append(requested_times, np.repeat(requested_times[-1], extra))
     plan = plan_paths(bound, requested_times, particles is not None or is_forecast is not None,
                  first_simulated_times(bound) if is_forecast else np.full(bound.times.shape[:-1], -np.inf))

@@ -7,6 +7,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering import intervals, time_grid
+from lfm_ppl.filtering.grid_layout import _padded_lengths, padded_size
 
 TIMES = np.sort(np.random.default_rng(3).uniform(0.0, 9.0, 21))
 Y = np.sin(TIMES)[:, None]
@@ -40,3 +41,11 @@ def test_derivatives_with_respect_to_times():
     change = 1e-5 * np.eye(21)[7]
     difference = (log_prob((1.3, 0.4, 0.8), TIMES + change) - log_prob((1.3, 0.4, 0.8), TIMES - change)) / 2e-5
     np.testing.assert_allclose(gradient[7], difference, rtol=1e-6)
+
+
+@pytest.mark.parametrize("lengths", [(17, 24), (26, 31), (42, 47)])
+def test_tables_of_similar_numbers_of_lengths_have_one_size(lengths):
+    """Of a few hundred intervals, as default trajectories have them, where a table was not padded."""
+    sizes = {_padded_lengths(count, 256) for count in lengths}
+    assert sizes == {padded_size(lengths[1])}
+    assert _padded_lengths(300, 256) == 256

@@ -138,6 +138,15 @@ def test_many_steps_equal_single_steps(name):
         assert_allclose(result, expected, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.parametrize("name", ["undamped", "units apart", "nine states"])
+def test_steps_without_noise_have_the_same_transitions(name):
+    feedback = -np.eye(9) if name == "nine states" else SYSTEMS[name]
+    transition, noise = jax.jit(lambda feedback: discretise_steps(feedback, None, jnp.asarray(DTS)))(feedback)
+    expected, _ = jax.jit(discretise_steps)(feedback, np.eye(len(feedback)), DTS)
+    assert_allclose(transition, expected, rtol=1e-14)
+    assert_array_equal(noise, np.zeros_like(transition))
+
+
 def test_gradients_of_many_steps():
     def flow(feedback, diffusion, dts):
         return jnp.stack(discretise_steps(feedback, diffusion @ diffusion.T, dts, 8))

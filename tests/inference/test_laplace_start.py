@@ -42,20 +42,43 @@ def two_modes():
     numpyro.factor("bumps", jnp.logaddexp(-0.5 * ((x - 4.0) / 0.3) ** 2, 1.0 - 0.5 * ((x + 4.0) / 0.3) ** 2))
 
 
-def flat():
-    x, y = numpyro.sample("x", dist.ImproperUniform(dist.constraints.real, (), ())), numpyro.sample(
-        "y", dist.ImproperUniform(dist.constraints.real, (), ()))
-    numpyro.factor("sum", -0.5 * (x + y) ** 2)
-
-
 def many():
     numpyro.sample("x", dist.Normal().expand([MAX_PARAMETERS + 1]).to_event(1))
 
 
-@pytest.mark.parametrize("model, name", [(two_modes, "mode"), (flat, "x, y"), (many, str(MAX_PARAMETERS + 1))])
+@pytest.mark.parametrize("model, name", [(two_modes, "mode"), (many, str(MAX_PARAMETERS + 1))])
 def test_a_mode_that_does_not_describe_the_posterior_is_refused(model, name):
     with pytest.raises(UnusableModeError, match=name):
         laplace_approximation(jax.random.key(0), bound(model))
+
+
+DIRECTIONS = {
+    "one of three": np.array([[2.0, 1.0, 0.0], [0.0, 3.0, 0.0]]),
+    "two of three": np.array([[0.0, 5.0, 0.0]]),
+    "rotated": np.array([[1.0, 2.0, 0.0], [0.0, 0.0, 100.0]]),
+    "all": np.zeros((1, 3)),
+}
+"""Rows that the data inform about; the density is flat along all orthogonal directions."""
+
+
+@pytest.mark.parametrize("rows", DIRECTIONS.values(), ids=DIRECTIONS)
+def test_flat_directions_have_variance_one_and_the_others_the_inverse_hessian(rows):
+    def model():
+        z = numpyro.sample("z", dist.ImproperUniform(dist.constraints.real_vector, (), (3,)))
+        numpyro.factor("informed", -0.5 * ((rows @ (z - 1.0)) ** 2).sum())
+
+    laplace = laplace_approximation(jax.random.key(0), bound(model))
+    flat = np.linalg.svd(rows)[2][np.linalg.matrix_rank(rows):]
+    # The covariance of what is informed about is that of independent unit errors, whatever is flat.
+    if rows.any():
+        assert_allclose(rows @ laplace.covariance @ rows.T, np.eye(len(rows)), atol=1e-4)
+    assert (np.linalg.eigvalsh(laplace.covariance) > 0.0).all()
+    for direction in flat:
+        precision = direction @ np.linalg.solve(laplace.covariance, direction)
+        assert 0.3 < 1.0 / precision < 3.0
+    points = starting_points(jax.random.key(0), bound(model), laplace, 200)
+    assert np.isfinite(points).all()
+    assert_allclose((points @ flat.T).std(axis=0), 2.0, rtol=0.6)
 
 
 def test_starting_points_have_twice_the_standard_deviation():

@@ -7,6 +7,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from compiled_programs import compilations
 from jax.flatten_util import ravel_pytree
 from numpyro.infer import init_to_uniform
 from scipy.special import gammaln
@@ -334,3 +335,14 @@ def test_derivatives_that_do_not_exist_are_reported():
     assert np.isnan(result.log_evidence)
     with pytest.raises(ValueError, match="no Laplace approximation to draw from"):
         result.sample(jax.random.key(0), 3)
+
+
+@pytest.mark.parametrize("restarts", [2, 7])
+def test_starts_and_draws_compile_few_programs(restarts):
+    """The model, its priors and the search; random keys, signs and draws take none of each number of starts."""
+    map_estimate(regression, DESIGN, DATA, restarts=3)
+    with compilations() as names:
+        result = map_estimate(regression, DESIGN, DATA, restarts=restarts)
+        draws = result.sample(jax.random.key(0), 5)
+    assert draws["slope"].shape == (5, 2)
+    assert len(names) <= 6, names
