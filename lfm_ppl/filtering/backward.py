@@ -116,7 +116,8 @@ def backward(problem: FilterProblem, trace: FilterTrace, adjoint_only: bool = Fa
     (first, _, _), (smoothed_ends, left_out, adjoint, predictor) = jax.lax.scan(
         jax.checkpoint(step, prevent_cse=False), carry, rows, reverse=True)
     moments = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, smoothed_ends)
-    return SmootherTrace(moments, *left_out, adjoint, predictor)
+    rows_left_out, entries_left_out = left_out
+    return SmootherTrace(moments, rows_left_out, entries_left_out, adjoint, predictor)
 
 
 def _smoothed_predictor(update: Update, predicted: Moments, r: jax.Array, adjoint: jax.Array) -> SmoothedPredictor:

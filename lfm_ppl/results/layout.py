@@ -241,7 +241,7 @@ def entry_coordinates(data: xr.Dataset, is_observed: np.ndarray) -> dict[str, An
     dims = list(next(data[name].dims for name in data.data_vars))
     times = times_of(data).transpose(*(dim for dim in dims if dim in times_of(data).dims))
     index = dict(zip(dims, np.nonzero(is_observed), strict=True))
-    coordinates = {dim: (ENTRY, data[dim].values[index[dim]]) for dim in dims if dim != "time"}
+    coordinates = {str(dim): (ENTRY, data[dim].values[index[dim]]) for dim in dims if dim != "time"}
     return {"time": (ENTRY, times.values[tuple(index[str(dim)] for dim in times.dims)], times.attrs), **coordinates}
 
 
