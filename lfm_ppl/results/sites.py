@@ -125,7 +125,6 @@ def all_sites_of(result: Any) -> tuple[Any, str]:
     attributes = arviz_data.attributes(result)
     selected = json.loads(attributes[_SELECTED])
     name, settings = selected["name"], selected["sites"]
-    stored = name.replace("/", ".")
     own = {group: arviz_data.group(result, group) for group in ("posterior", _DATA, "one_step_ahead", inputs.GROUP)
            if arviz_data.has_group(result, group)}
     own[_DATA] = own[_DATA].rename({_VARIABLE: name})
