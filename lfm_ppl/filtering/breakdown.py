@@ -182,7 +182,7 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
         return None
     rows = jax.tree.map(np.asarray, grid.intervals)
     previous = start if row == 0 else Moments(trace.filtered.mean[row - 1], trace.filtered.covariance[row - 1])
-    count = 1 if ssm.has_constant_coefficients or grid.tolerance is not None else grid.steps
+    count = 1 if ssm.plan.has_exact_transition or grid.tolerance is not None else grid.steps
     interval: Intervals = jax.tree.map(lambda column: column[row:row + 1], rows)
     stepwise = _run_filter(ssm, rule, _divide_interval(grid, interval, count), y, previous)
     step = _first_bad_row(stepwise)
@@ -198,7 +198,7 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
         where += f", step {step + 1} of {count} from time {interval.start[0]:.6g} to {interval.end[0]:.6g}"
     stiff = 'method="exponential" for stiff dynamics, ' if grid.method == RUNGE_KUTTA else ""
     remedy = ("Try a longest step (max_step=...), more steps (steps=...) where known inputs vary fast, an observation "
-              "noise that is not so small, or other units" if ssm.has_constant_coefficients
+              "noise that is not so small, or other units" if ssm.plan.has_exact_transition
               else f"Try {stiff}more steps (up to five times steps={grid.steps} are tried), a larger tolerance, "
               "another rule, or a tighter prior" if grid.tolerance is not None
               else f"Try {stiff}more steps (steps=...), a longest step (max_step=...), steps that follow a tolerance "

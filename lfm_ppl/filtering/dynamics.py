@@ -24,6 +24,7 @@ from lfm_ppl.filtering.transition import IntegratingFactor, LinearPart
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
 from lfm_ppl.linearisation.structure import InputStructure
+from lfm_ppl.model.integration_plan import LinearisedInputs
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils.linalg import congruence, diagonal, fastest_rate, matmul, outer_square
 
@@ -157,15 +158,7 @@ def is_nonlinear_in_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
     Its Jacobian K then reads only the forces, which only their own exact transition moves: K E K = 0.
     """
     uses_full_state = isinstance(rule, SigmaPointRule) and rule.full_state
-    structure = ssm.drift_structure
-    return not uses_full_state and all(
-        index >= ssm.physical_dim for index in (*structure.nonlinear, *structure.averaged))
-
-
-def is_autonomous(ssm: StateSpaceModel) -> bool:
-    """Return whether the dynamics is one function of the state at all times."""
-    return (ssm.constant_measurement and ssm.constant_mean and not ssm.drift_structure.offset_varies
-            and not callable(ssm.model.process_noise))
+    return not uses_full_state and ssm.plan.linearised is not LinearisedInputs.STATES
 
 
 def linearization_indices(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:

@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.dynamics import Dynamics, covariance_of, is_autonomous, linearize_drift
+from lfm_ppl.filtering.dynamics import Dynamics, covariance_of, linearize_drift
 from lfm_ppl.filtering.moments import Moments, Prediction, compose, matvec, transform
 from lfm_ppl.filtering.transition import feedback
 from lfm_ppl.forces.discretise import discretise_driven
@@ -96,7 +96,7 @@ def exponential_step(dynamics: Dynamics, span: Span, h: jax.Array, moments: Mome
         middle = linearize_at(1, midpoint)
         second_order = predict(_flow(middle, h)).moments
         end = linearize_at(2, second_order)
-        if not is_autonomous(dynamics.ssm):
+        if not dynamics.ssm.plan.is_autonomous:
             # XLA removes this where the error is not used.
             deviation = midpoint.mean - moments.mean
             offsets = [matvec(sde.feedback - middle.feedback, deviation) + sde.offset

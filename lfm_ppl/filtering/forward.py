@@ -200,7 +200,7 @@ def predict(problem: FilterProblem, interval: Intervals, moments: Moments, about
     """
     ssm, _, grid, shared = problem
     dynamics, transition = problem.dynamics, shared.transition(interval)
-    is_exact = ssm.has_constant_coefficients
+    is_exact = ssm.plan.has_exact_transition
     has_nodes = record is Record.LINEARIZATION and grid.tolerance is None and not is_exact
     if record is Record.LINEARIZATION and not has_nodes:
         record = Record.SMOOTHER
@@ -258,7 +258,7 @@ def maps_about(problem: FilterProblem, points: LinearizationPoints | None) -> In
     points.
     """
     ssm, rule, grid, _ = problem
-    if ssm.time_invariant or grid.tolerance is not None:
+    if ssm.plan.has_exact_noise or grid.tolerance is not None:
         return None
 
     def interval_map(inputs: tuple[Intervals, Moments | None]) -> IntervalMaps:

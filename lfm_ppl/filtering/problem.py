@@ -77,14 +77,14 @@ def filter_problem(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> FilterPr
     is_tabulated = grid.lengths is not None and len(grid.lengths) <= max(_FEW_LENGTHS, count // _INTERVALS_PER_LENGTH)
 
     def transition(length: jax.Array) -> Any:
-        if ssm.has_constant_coefficients:
+        if ssm.plan.has_exact_transition:
             return exact(ssm, length, grid.steps, linear)
         if grid.tolerance is not None:
             return None
         return interval_factor(ssm, rule, linear, length, grid.steps, is_tabulated)
 
     grid = with_state_maps(ssm, grid)
-    if grid.lengths is None and ssm.has_constant_coefficients:
+    if grid.lengths is None and ssm.plan.has_exact_transition:
         grid = with_transitions(grid, transition)
         transition_of: Callable[[Intervals], Any] = operator.attrgetter("transition")
     else:
@@ -98,22 +98,6 @@ def _observation_jacobian(ssm: StateSpaceModel, grid: TimeGrid) -> jax.Array:
     t = jnp.asarray(grid.initial_time, float)
     w = ssm.inputs(ssm.initial()[0], t)
     return constant_jacobian(lambda v: (ssm.observe(v, t), ()), w, ssm.observation_structure, ssm.output_dim)
-
-
-def is_observation_nonlinear(ssm: StateSpaceModel) -> bool:
-    """Return whether the linearisation of an observation depends on the moments about which it is made."""
-    observation = ssm.model.observation
-    return bool(not ssm.observation_structure.linear or observation.angular or observation.varies_with_state)
-
-
-def is_linear(ssm: StateSpaceModel) -> bool:
-    """Return whether no pass depends on the moments about which the model is linearised."""
-    return ssm.drift_structure.linear and ssm.observation_structure.linear
-
-
-def is_affine(ssm: StateSpaceModel) -> bool:
-    """Return whether dynamics and observation are affine in states and forces, with noise independent of them."""
-    return is_linear(ssm) and not is_observation_nonlinear(ssm)
 
 
 def at_intervals(tree: Any, intervals: Any) -> Any:

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.dynamics import DriftLinearization, Dynamics, is_autonomous, linearize_drift
+from lfm_ppl.filtering.dynamics import DriftLinearization, Dynamics, linearize_drift
 from lfm_ppl.filtering.moments import Moments, Prediction, matvec, transform
 from lfm_ppl.filtering.runge_kutta import WEIGHTS, process_cov_at, stack_diffusions
 from lfm_ppl.filtering.transition import IntegratingFactor
@@ -87,7 +87,7 @@ def step_maps(dynamics: Dynamics, factor: IntegratingFactor, steps: int, span: S
             remainder = remainder + matvec(jacobian, mean - point.mean)
         return _Node(jnp.concatenate([jacobian, remainder[:, None]], axis=1), drift.diffusion)
 
-    if is_autonomous(ssm):
+    if ssm.plan.is_autonomous:
         times = span.time(0.5 * h * jnp.arange(2 * steps + 1))
         nodes = jax.vmap(linearize_node)(times, forces.mean, point)
         first_middle_last = [jax.tree.map(lambda a, part=part: a[part], nodes) for part in _FIRST_MIDDLE_LAST]

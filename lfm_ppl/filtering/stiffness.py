@@ -108,7 +108,7 @@ def has_explicit_steps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> bool
 
     Where only the forces enter non-linearly, no state is integrated explicitly (`lfm_ppl.filtering.simpson`).
     """
-    is_explicit = grid.method != EXPONENTIAL and grid.tolerance is None and not ssm.has_constant_coefficients
+    is_explicit = grid.method != EXPONENTIAL and grid.tolerance is None and not ssm.plan.has_exact_transition
     return bool(ssm.physical_dim) and is_explicit and not is_nonlinear_in_forces_only(ssm, rule)
 
 

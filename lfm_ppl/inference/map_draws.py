@@ -92,7 +92,7 @@ def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable | SharedF
     draws = {site: np.asarray(value) for site, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
     example = bound.site.example
-    is_vectorized = rows is not None and (example.tolerance is None or example.ssm.has_constant_coefficients)
+    is_vectorized = rows is not None and (example.tolerance is None or example.ssm.plan.has_exact_transition)
     batch, parallel = _batch_size(count, rows, example.ssm.state_dim, is_vectorized)
 
     def sequential(draws: Any, keys: jax.Array, *arguments: Any) -> Any:

@@ -157,10 +157,10 @@ class MarginalLikelihood(SeriesLikelihood):
         """How the likelihood is computed: exact or by which approximation."""
         if self.is_family:
             return f"approximate (sites by {self.sites_in_words})"
-        if self.is_affine:
-            if self.ssm.is_integrated_exactly:
+        if self.ssm.plan.is_linear:
+            if self.ssm.plan.has_exact_moments:
                 return "exact (the model is linear)"
-            if self.ssm.has_constant_coefficients:
+            if self.ssm.plan.has_exact_transition:
                 ignored = "" if self.tolerance is None else "; tolerance has no effect"
                 return f"exact transitions, known inputs integrated in {self.steps} steps between two times{ignored}"
             return "linear model, integrated " + (f"in {self.steps} steps between two times" if self.tolerance is None
@@ -182,8 +182,8 @@ class MarginalLikelihood(SeriesLikelihood):
         if not self.is_family:
             return ""
         settings = self.site_settings
-        is_linear = not (self.ssm.drift_structure.nonlinear or self.ssm.observation_structure.nonlinear)
-        return settings.method + ("" if is_linear else f", linearised at most {settings.relinearisations} times")
+        count = f", linearised at most {settings.relinearisations} times"
+        return settings.method + ("" if self.ssm.plan.is_linear else count)
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log marginal likelihood of ``value`` (T, D), NaN where missing; batch dimensions may lead."""

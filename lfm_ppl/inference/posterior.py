@@ -142,7 +142,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
     particles, particle_steps = settings
     example = bound.site.example
     is_forecast = None
-    if particles is None and example.has_gaussian_state and example.ssm.drift_structure.nonlinear:
+    if particles is None and example.has_gaussian_state and not example.ssm.plan.has_normal_states:
         is_forecast = has_forecast(bound, requested_times)
     is_shared = particles is None and bound.traced.inputs is not None
     count = None if requested_times is None else requested_times.shape[-1]
@@ -199,7 +199,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
                     "y": replicated}
         mean = output[requested]
         variance = jnp.zeros_like(mean)
-        if smoothed is not None and _normal_outputs(ssm):
+        if smoothed is not None and ssm.plan.has_normal_outputs:
             # The normal distribution of y given the parameters, much sharper than given a path.
             matrix = jax.vmap(jax.jacfwd(ssm.observe))(smoothed.input_mean[requested], when[requested])
             spread = jnp.einsum("kdi,kij,kdj->kd", matrix, smoothed.input_covariance[requested], matrix)
@@ -298,7 +298,7 @@ def _points(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, when: 
     A point has the same coordinates, in units of the distribution, at all times, so that it moves smoothly. Where a
     path is simulated, all points are on the path. ``with_noise`` adds the standard deviations of Gaussian noise.
     """
-    nonlinear = isinstance(ssm.model.observation, ObservationFamily) or not _normal_outputs(ssm)
+    nonlinear = isinstance(ssm.model.observation, ObservationFamily) or not ssm.plan.has_normal_outputs
     if not (nonlinear or ssm.model.deterministic_names):
         return {}
     requested = plan.requested
@@ -334,12 +334,6 @@ def noise_of_rows(distribution: SeriesLikelihood) -> bool:
     if isinstance(observation, ObservationFamily):
         return observation.has_row_parameters()
     return not observation.varies_with_state and np.ndim(observation.covariance) == 3
-
-
-def _normal_outputs(ssm: StateSpaceModel) -> bool:
-    """Return whether y is normal where the state is: a linear observation with noise that does not depend on it."""
-    observation = ssm.model.observation
-    return not (ssm.observation_structure.nonlinear or observation.varies_with_state or observation.angular)
 
 
 def _particle_path(distribution: SeriesLikelihood, y: jax.Array, requested_times: Any, key: jax.Array,

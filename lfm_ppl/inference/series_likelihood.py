@@ -29,7 +29,7 @@ from lfm_ppl.filtering.forward import forward
 from lfm_ppl.filtering.grid_layout import GridLayout
 from lfm_ppl.filtering.intervals import RUNGE_KUTTA, TimeGrid
 from lfm_ppl.filtering.iterated import posterior_linearisation
-from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_affine
+from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
 from lfm_ppl.filtering.smoother import SmootherResult, filtered_mean, smooth_on
 from lfm_ppl.filtering.stiffness import ExplicitSteps, explicit_steps, has_explicit_steps, warn_of_long_steps
 from lfm_ppl.filtering.time_grid import build_time_grid, lay_out_time_grid
@@ -115,11 +115,6 @@ class SeriesLikelihood(dist.Distribution):
     def problem(self) -> FilterProblem:
         """The filter problem: model, rule and time grid, with what all intervals share."""
         return filter_problem(self.ssm, self.rule, self.time_grid)
-
-    @property
-    def is_affine(self) -> bool:
-        """Whether dynamics and observation are affine in states and forces, with noise independent of them."""
-        return is_affine(self.ssm)
 
     @property
     def is_family(self) -> bool:
