@@ -31,8 +31,9 @@ import jax.numpy as jnp
 
 from lfm_ppl.filtering.backward import SmootherTrace, at_interval_starts, backward
 from lfm_ppl.filtering.dynamics import columns, linearization_indices
-from lfm_ppl.filtering.forward import FilterTrace, LinearizationPoints, NodeRecord, forward
+from lfm_ppl.filtering.forward import FilterTrace, LinearizationPoints, forward
 from lfm_ppl.filtering.moments import Moments, Record, matvec
+from lfm_ppl.filtering.predict import NodeRecord
 from lfm_ppl.filtering.problem import FilterProblem
 from lfm_ppl.filtering.update import Updater
 from lfm_ppl.model.observations.family import ObservationFamily

@@ -18,6 +18,7 @@ from typing import Any, Protocol, cast
 import jax
 import numpy as np
 
+from lfm_ppl.filtering.integrators.integrator import Stepping
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood
@@ -92,7 +93,8 @@ def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable | SharedF
     draws = {site: np.asarray(value) for site, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
     example = bound.site.example
-    is_vectorized = rows is not None and (example.tolerance is None or example.ssm.plan.has_exact_transition)
+    is_adaptive = any(integrator.stepping is Stepping.ADAPTIVE for integrator in example.integrators)
+    is_vectorized = rows is not None and not is_adaptive
     batch, parallel = _batch_size(count, rows, example.ssm.state_dim, is_vectorized)
 
     def sequential(draws: Any, keys: jax.Array, *arguments: Any) -> Any:

@@ -25,7 +25,7 @@ from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.evidence import Evidence, evidence
 from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
-from lfm_ppl.filtering.intervals import EXPONENTIAL, METHODS, RUNGE_KUTTA
+from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS
 from lfm_ppl.filtering.iterated import number_of_iterations
 from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
@@ -128,7 +128,7 @@ class MarginalLikelihood(SeriesLikelihood):
     def __init__(self, model: LatentForceModel, times: ArrayLike, rule: Rule | None = None, steps: int = 10,
                  max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
                  tolerance: float | None = None, sites: SiteSettings | str | None = None, *,
-                 method: str = RUNGE_KUTTA,
+                 method: str = DEFAULT_METHOD,
                  lower: Mapping[str, ArrayLike] | None = None, upper: Mapping[str, ArrayLike] | None = None,
                  constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (),
                  grid: ArrayLike | int | None = None, draws: int = 256, validate_args: bool | None = None):
@@ -233,7 +233,7 @@ class MarginalLikelihood(SeriesLikelihood):
         """Return physical states (*sample_shape, T, M) and observations (*sample_shape, T, D); see `sample`."""
         initial_time, times = self.time_grid.initial_time, checks.concrete(self.times)
         steps, breakpoints = SIMULATION_STEPS * self.steps, input_breakpoints(self.model, times, initial_time)
-        program = SimulationProgram(self.ssm, steps, breakpoints, self.method == EXPONENTIAL)
+        program = SimulationProgram(self.ssm, steps, breakpoints, self.is_stiff)
         lengths = checks.concrete(self.time_grid.intervals.length)
         if times is not None and lengths is not None and not checks.traced(initial_time):
             if self.tolerance is None:
@@ -254,12 +254,12 @@ def _check_model(model: Any) -> None:
 
 
 def _refuse_filter_settings(max_step: Any = None, iterations: Any = None, damping: float = 0.7, tolerance: Any = None,
-                            sites: Any = None, method: str = RUNGE_KUTTA, validate_args: Any = None) -> None:
+                            sites: Any = None, method: str = DEFAULT_METHOD, validate_args: Any = None) -> None:
     """Raise ValueError for a setting of the filter that a likelihood under constraints does not have."""
     for name, value in (("max_step", max_step), ("tolerance", tolerance)):
         if value is not None:
             raise ValueError(f"{name} is not supported under constraints, which add rows to the grid; raise steps.")
-    if method != RUNGE_KUTTA:
+    if method != DEFAULT_METHOD:
         raise ValueError(f"method={method!r} is not supported under constraints; leave method out.")
     if iterations:
         raise ValueError("under constraints a non-linear model is always linearised about smoothed moments. Leave "

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.grid_layout import GridLayout, padded_size
-from lfm_ppl.filtering.intervals import EXPONENTIAL
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
@@ -112,7 +111,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     at = None if at is None else np.asarray(at, float)
     if at is not None and np.array_equal(at, bound.times):
         at = None
-    is_stiff = bound.site.example.method == EXPONENTIAL
+    is_stiff = bound.site.example.is_stiff
     settings = particles, particle_steps
     paths = _paths(key, bound, draws, at, settings, is_stiff, report=report, store=store)
     if _PRODUCT not in paths:

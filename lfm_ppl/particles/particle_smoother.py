@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lfm_ppl.filtering.integrators.exact import exact_offset
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, as_arrays
-from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.transition import exact
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.state_space import StateSpaceModel, state_space

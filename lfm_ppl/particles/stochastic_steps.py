@@ -25,8 +25,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.filtering.integrators.exact import exact_offset
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, by_length
-from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.transition import Exact, exact
 from lfm_ppl.forces.discretise import discretise
 from lfm_ppl.model.state_space import Span, StateSpaceModel

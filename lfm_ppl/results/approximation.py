@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from lfm_ppl.filtering.integrators.integrator import Stepping
 from lfm_ppl.filtering.iterated import DEFAULT_ITERATIONS
 from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
@@ -133,8 +134,8 @@ def _long_steps(likelihood: SeriesLikelihood) -> list[str]:
     length = checks.concrete(grid.intervals.length)
     lengthscales = [float(force.lengthscale) for force in jax.tree_util.tree_leaves(
         likelihood.model.forces, is_leaf=lambda part: isinstance(part, Stretched)) if isinstance(force, Stretched)]
-    is_exact = likelihood.tolerance is not None or all(ssm.plan.has_exact_transition for ssm in likelihood.ssms)
-    if is_exact or length is None or not lengthscales:
+    has_equal_steps = any(integrator.stepping is Stepping.EQUAL for integrator in likelihood.integrators)
+    if not has_equal_steps or length is None or not lengthscales:
         return []
     step, longest = float(length.max()) / grid.steps, 0.5 * min(lengthscales)
     if step <= longest:
