@@ -94,7 +94,7 @@ def _print_sites(model: loading.ModelFile, bound: Any) -> None:
     parts = [f"{example.rule.name}, {example.steps} steps", example.iterations and f"{example.iterations} iterations"]
     text = ", ".join(filter(None, parts)) + (f"; sites by {example.sites_in_words}" if example.sites_in_words else "")
     if is_exact(example.ssm) or not example.has_gaussian_state:
-        is_exact_likelihood = example.has_gaussian_state and example.ssm.is_integrated_exactly
+        is_exact_likelihood = example.has_gaussian_state and example.ssm.plan.has_exact_moments
         text = "exact: the model is linear" if is_exact_likelihood else example.description
     print(f"likelihood: {text}\n")
     model_names = {"time", *model.inputs, *system.output_names, *system.state_names, *system.force_names,

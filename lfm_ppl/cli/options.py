@@ -53,6 +53,14 @@ def _check_time_unit(hint: Any, unit: str | None) -> None:
         checks.one_of("unit of time", unit, calendar_time.SECONDS)
 
 
+def _check_method(hint: Any, method: str | None) -> None:
+    if method is not None:
+        from lfm_ppl.filtering.integrators.methods import METHODS
+        from lfm_ppl.utils import checks
+
+        checks.one_of("method", method, METHODS)
+
+
 def _integer(least: int) -> Callable:
     return _number(int, lambda value: value >= least, f"a whole number of at least {least}")
 
@@ -237,8 +245,8 @@ class Approximation:
     """longest integration step"""
     tolerance: Annotated[Positive, Parameter(metavar="SD")] | None = None
     """adaptive steps: largest error of an integration step, in standard deviations; excludes --iterations"""
-    method: Annotated[str, Parameter(choices=("runge-kutta", "exponential"), metavar="METHOD")] | None = None
-    """method of integration: explicit, or exponential steps for stiff dynamics"""
+    method: Annotated[str, Parameter(metavar="METHOD", validator=_check_method)] | None = None
+    """method of integration: runge-kutta, or exponential for stiff dynamics"""
     iterations: CountOrZero | None = None
     """iterations of posterior linearisation; 0: a single pass"""
     lower: Pairs = ()

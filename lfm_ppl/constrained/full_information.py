@@ -30,7 +30,6 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observation_noise import check_noise
-from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import matmul
 from lfm_ppl.utils.programs import shared_jit
@@ -161,7 +160,7 @@ def full_information(model: LatentForceModel, times: ArrayLike, y: ArrayLike,
     model.check_at(scan_grid.initial_time, np.shape(times)[0])
     y = check_observations(y, np.shape(times)[0], len(model.output_names))
     warn_single_precision()
-    linear = is_linear(ssm)
+    linear = ssm.plan.has_fixed_weights
     if not linear:
         check_noise(ssm, scan_grid.initial_time)
     problem = ConstrainedProblem(ssm, scan_grid, rows, y, Moments(*ssm.initial()))
@@ -178,12 +177,6 @@ def check_settings(model: LatentForceModel, tolerance: float, max_passes: int) -
                         "link, such as softplus, in the dynamics.")
     checks.positive("tolerance", tolerance, "It is in units of the log density.")
     checks.positive_integer("max_passes", max_passes)
-
-
-def is_linear(ssm: StateSpaceModel) -> bool:
-    """Return whether the linearisations of transitions, observations and constraints do not depend on the state."""
-    return (ssm.drift_structure.linear and ssm.observation_structure.linear and not callable(ssm.model.process_noise)
-            and not ssm.model.observation.varies_with_state)
 
 
 def solve_problem(problem: ConstrainedProblem, constraints: Constraints, tolerance: float, max_passes: int,

@@ -53,9 +53,10 @@ from lfm_ppl.constrained.interior_point import (
     weighted_noise,
 )
 from lfm_ppl.filtering.backward import SmootherTrace, backward
-from lfm_ppl.filtering.forward import FilterTrace, IntervalMaps, LinearizationPoints, forward, predict
+from lfm_ppl.filtering.forward import FilterTrace, IntervalMaps, LinearizationPoints, forward
 from lfm_ppl.filtering.intervals import as_arrays
 from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.predict import predict
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.taylor import Taylor

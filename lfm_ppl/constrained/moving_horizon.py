@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 
 from lfm_ppl.constrained.augmented import Rows, augmented_model
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
-from lfm_ppl.constrained.full_information import ConstrainedEstimate, check_settings, is_linear, solve_problem
+from lfm_ppl.constrained.full_information import ConstrainedEstimate, check_settings, solve_problem
 from lfm_ppl.constrained.gauss_newton import ConstrainedDynamics
 from lfm_ppl.constrained.interior_point import ConstrainedProblem
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
@@ -296,7 +296,7 @@ def _build_settings(model: LatentForceModel, constraints: Constraints, window: i
         raise ValueError("a moving window does not support events; leave them out, or take lfm.full_information.")
     index = np.arange(window)
     ssm = augmented_model(model, constraints, Rows(index, index, index, np.zeros(window, int)))
-    linear = is_linear(ssm)
+    linear = ssm.plan.has_fixed_weights
     if not linear:
         check_noise(ssm, 0.0 if model.initial_time is None else model.initial_time)
     warn_single_precision()

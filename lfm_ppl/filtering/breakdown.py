@@ -20,7 +20,9 @@ from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.forward import FilterTrace, forward
-from lfm_ppl.filtering.intervals import RUNGE_KUTTA, Intervals, TimeGrid, intervals_between
+from lfm_ppl.filtering.integrators.integrator import Stepping
+from lfm_ppl.filtering.integrators.methods import METHODS, choose_integrator
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid, intervals_between
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.update import GaussianUpdate
@@ -182,7 +184,8 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
         return None
     rows = jax.tree.map(np.asarray, grid.intervals)
     previous = start if row == 0 else Moments(trace.filtered.mean[row - 1], trace.filtered.covariance[row - 1])
-    count = 1 if ssm.has_constant_coefficients or grid.tolerance is not None else grid.steps
+    stepping = choose_integrator(ssm, rule, grid.method, grid.tolerance).stepping
+    count = grid.steps if stepping is Stepping.EQUAL else 1
     interval: Intervals = jax.tree.map(lambda column: column[row:row + 1], rows)
     stepwise = _run_filter(ssm, rule, _divide_interval(grid, interval, count), y, previous)
     step = _first_bad_row(stepwise)
@@ -196,11 +199,11 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
     where = f"row {later[0]} (time {time:.6g})" if later.size else f"time {time:.6g}, after the last observation"
     if count > 1 and step is not None:
         where += f", step {step + 1} of {count} from time {interval.start[0]:.6g} to {interval.end[0]:.6g}"
-    stiff = 'method="exponential" for stiff dynamics, ' if grid.method == RUNGE_KUTTA else ""
+    stiff = 'method="exponential" for stiff dynamics, ' if METHODS[grid.method].is_explicit else ""
     remedy = ("Try a longest step (max_step=...), more steps (steps=...) where known inputs vary fast, an observation "
-              "noise that is not so small, or other units" if ssm.has_constant_coefficients
+              "noise that is not so small, or other units" if stepping is Stepping.NONE
               else f"Try {stiff}more steps (up to five times steps={grid.steps} are tried), a larger tolerance, "
-              "another rule, or a tighter prior" if grid.tolerance is not None
+              "another rule, or a tighter prior" if stepping is Stepping.ADAPTIVE
               else f"Try {stiff}more steps (steps=...), a longest step (max_step=...), steps that follow a tolerance "
               "(tolerance=1e-3), another rule, or a tighter prior")
     return f"the filter breaks down at {where}: {reason}. The log likelihood is -inf. {remedy}."

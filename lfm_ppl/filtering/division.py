@@ -91,7 +91,7 @@ def longest_step(ssm: StateSpaceModel, times: Any, origin: Any, steps: int) -> f
         origin: the initial time; the gap from there to the first observation counts as well.
         steps: integration steps between two consecutive times.
     """
-    if ssm.mean_invariant or checks.traced((times, origin)):
+    if ssm.plan.has_exact_offset or checks.traced((times, origin)):
         return None
     gaps = np.diff(np.asarray(times, float), prepend=float(origin))
     gaps = gaps[gaps > 0]

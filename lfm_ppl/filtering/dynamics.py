@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
-from lfm_ppl.filtering.intervals import EXPONENTIAL, RUNGE_KUTTA
 from lfm_ppl.filtering.moments import Moments, matvec
 from lfm_ppl.filtering.transition import IntegratingFactor, LinearPart
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
@@ -35,12 +34,11 @@ Congruence = Callable[[jax.Array, bool], jax.Array]
 
 
 class Dynamics(NamedTuple):
-    """A model, a linearisation rule, the constant linear part of the dynamics, and the method of integration."""
+    """A model, a linearisation rule, and the constant linear part of the dynamics."""
 
     ssm: StateSpaceModel
     rule: Rule
     linear: LinearPart
-    method: str = RUNGE_KUTTA
 
 
 class DriftLinearization(NamedTuple):
@@ -58,16 +56,22 @@ class DriftLinearization(NamedTuple):
 
 
 def minimum_sd(dynamics: Dynamics, factor: IntegratingFactor, t: jax.Array, h: jax.Array,
-               moments: Moments) -> jax.Array:
+               moments: Moments, settles: bool = False) -> jax.Array:
     """Return the standard deviation below which a coordinate counts as known: 1e-6 of its size during a step.
 
-    The time constant of a stiff state limits its change in an exponential step, however long that is.
+    Args:
+        dynamics: the model and the rule.
+        factor: the integrating factor of the step.
+        t: time of its start.
+        h: its length.
+        moments: at its start.
+        settles: whether the time constant of a stiff state limits its change, however long the step is.
     """
     ssm = dynamics.ssm
     size = ssm.physical_dim
     matrix, offset = ssm.input_map(t)
     w = matvec(matrix, moments.mean) + offset
-    if dynamics.method == EXPONENTIAL:
+    if settles:
         jacobian = partial_jacobian(lambda v: (ssm.drift(v, t), ()), w, tuple(range(size)))
         h = jnp.minimum(h, 1.0 / fastest_rate(jacobian))
     change = jnp.abs(ssm.drift(w, t)) * h
@@ -135,7 +139,7 @@ def linearize_drift(dynamics: Dynamics, t: jax.Array, mean: jax.Array, covarianc
         min_sd: see `minimum_sd`.
         about: moments to linearise about; None: the filter's moments.
     """
-    ssm, rule, linear, _ = dynamics
+    ssm, rule, linear = dynamics
 
     def function(w: jax.Array) -> tuple[jax.Array, Any]:
         dispersion = ssm.dispersion(w, t)
@@ -149,23 +153,6 @@ def linearize_drift(dynamics: Dynamics, t: jax.Array, mean: jax.Array, covarianc
     remainder = drift - matvec(linear.rows, mean)
     return DriftLinearization(remainder, affine.jacobian - linear.rows,
                               affine.extra if isinstance(affine.extra, jax.Array) else None)
-
-
-def is_nonlinear_in_forces_only(ssm: StateSpaceModel, rule: Rule) -> bool:
-    """Return whether the dynamics less its constant linear part depends on the forces alone.
-
-    Its Jacobian K then reads only the forces, which only their own exact transition moves: K E K = 0.
-    """
-    uses_full_state = isinstance(rule, SigmaPointRule) and rule.full_state
-    structure = ssm.drift_structure
-    return not uses_full_state and all(
-        index >= ssm.physical_dim for index in (*structure.nonlinear, *structure.averaged))
-
-
-def is_autonomous(ssm: StateSpaceModel) -> bool:
-    """Return whether the dynamics is one function of the state at all times."""
-    return (ssm.constant_measurement and ssm.constant_mean and not ssm.drift_structure.offset_varies
-            and not callable(ssm.model.process_noise))
 
 
 def linearization_indices(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:

@@ -22,7 +22,8 @@ from lfm_ppl.filtering.arguments import as_rule, check_observations, warn_single
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter, quantile_residuals
 from lfm_ppl.filtering.forward import FilterTrace, forward
-from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid
+from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS
+from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import at_intervals, filter_problem
 from lfm_ppl.filtering.stiffness import warn_of_long_steps
@@ -71,7 +72,7 @@ class FilterResult(eqx.Module):
 
 def filter(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule | None = None, steps: int = 10,
            max_step: float | None = None, start: FilterState | None = None,
-           tolerance: float | None = None, method: str = RUNGE_KUTTA) -> FilterResult:
+           tolerance: float | None = None, method: str = DEFAULT_METHOD) -> FilterResult:
     """Run the continuous-discrete Gaussian filter.
 
     Between observations the moments obey dm/dt = E[f], dP/dt = A P + P A' + E[G G'] with the rule's A; at an

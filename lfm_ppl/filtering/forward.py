@@ -2,7 +2,7 @@ r"""The forward scan: filtered moments and log likelihoods, for any rule and any
 
 For each interval of the time grid, in one fused scan,
 
-1. predict the moments over the interval: by its exact transition, by integration, or by a given affine map;
+1. predict the moments over the interval, by the integrator of the problem or by a given affine map;
 2. let the forces jump, where they do, and apply the event at its end;
 3. linearise the observation about the predicted moments, or about given ones;
 4. update the moments by an `Updater`: a Gaussian observation, Gaussian sites, or sites by moment matching;
@@ -21,20 +21,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl.filtering.adaptive import predict_interval_adaptively
-from lfm_ppl.filtering.dynamics import MINIMUM_SD, columns, embed_in_state, linearization_indices
+from lfm_ppl.filtering.dynamics import MINIMUM_SD, embed_in_state
+from lfm_ppl.filtering.integrators.integrator import Stepping
 from lfm_ppl.filtering.intervals import Intervals, as_arrays, with_observations
-from lfm_ppl.filtering.moments import Moments, Prediction, Record
-from lfm_ppl.filtering.predict import (
-    StepRecord,
-    apply_event,
-    apply_jump,
-    identity_prediction,
-    jump_map,
-    predict_by_map,
-    predict_exact,
-    predict_interval,
-)
+from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.predict import predict, predict_by_map
 from lfm_ppl.filtering.problem import FilterProblem
 from lfm_ppl.filtering.update import (
     INNOVATION_FACTOR,
@@ -44,7 +35,6 @@ from lfm_ppl.filtering.update import (
     Updater,
     linearize_observation,
 )
-from lfm_ppl.utils.linalg import matmul
 
 _STORED = jax.checkpoint_policies.save_only_these_names(MINIMUM_SD, UPDATE_FAILED, INNOVATION_FACTOR)
 """What reverse mode stores of an interval besides its inputs."""
@@ -61,18 +51,6 @@ class LinearizationPoints(NamedTuple):
 
     nodes: Moments
     end_moments: Moments | None
-
-
-class NodeRecord(NamedTuple):
-    """Moments of the linearised states at the ends of the steps of an interval; k states, J steps.
-
-    Attributes:
-        moments: predicted, (J, k) and (J, k, k).
-        cross: (J, k, n), covariance with the whole state at the interval's end, after a jump.
-    """
-
-    moments: Moments
-    cross: jax.Array
 
 
 class IntervalMaps(NamedTuple):
@@ -127,10 +105,9 @@ def forward(problem: FilterProblem, updater: Updater, *, initial: Moments | None
         record: recorded output.
         maps: affine maps of the intervals, where they are known; of ``about`` only the ``end_moments`` are used then.
     """
-    ssm, rule, grid, _ = problem
+    ssm, rule, grid = problem.ssm, problem.rule, problem.grid
     start = problem.initial(initial)
     update = updater.bind(problem, start)
-    has_map = record is Record.SMOOTHER or (record is Record.LINEARIZATION and grid.tolerance is not None)
 
     def step(moments: Moments, inputs: tuple) -> tuple[Moments, FilterTrace]:
         interval, row, points, interval_map = inputs
@@ -148,8 +125,9 @@ def forward(problem: FilterProblem, updater: Updater, *, initial: Moments | None
             trace = trace._replace(predicted=prediction.moments, filtered=updated.moments,
                                    update=_recorded_update(updated, record))
         if record in (Record.LINEARIZATION, Record.SMOOTHER):
-            trace = trace._replace(phi=prediction.phi, process_cov=prediction.process_cov if has_map else None,
-                                   nodes=prediction.nodes)
+            trace = trace._replace(phi=prediction.phi, nodes=prediction.nodes)
+        if record is Record.SMOOTHER:
+            trace = trace._replace(process_cov=prediction.process_cov)
         return updated.moments, trace
 
     # The data enter here: each field of the updater, a row for each observation, gets a row for each interval.
@@ -171,10 +149,9 @@ def update_at_end(problem: FilterProblem, update: RowUpdate, interval: Intervals
         predicted: moments at its end.
         centre: moments about which the observation is linearised; None: the predicted ones.
     """
-    ssm, rule, _, shared = problem
     index = jnp.maximum(interval.observation, 0)
-    observation = linearize_observation(ssm, rule, shared.observation_jacobian, interval.end, index,
-                                        predicted if centre is None else centre)
+    observation = linearize_observation(problem.ssm, problem.rule, problem.shared.observation_jacobian, interval.end,
+                                        index, predicted if centre is None else centre)
     if centre is not None:
         observation = observation.shifted(predicted.mean - centre.mean)
     return update(observation, index, row, predicted)
@@ -187,68 +164,6 @@ def _recorded_update(update: Update, record: Record) -> Update:
     return update
 
 
-def predict(problem: FilterProblem, interval: Intervals, moments: Moments, about: Moments | None = None,
-            record: Record = Record.LIKELIHOOD) -> Prediction:
-    """Predict over an interval, a jump or an event at its end included.
-
-    Args:
-        problem: the model, the rule and the time grid.
-        interval: one interval.
-        moments: at its start.
-        about: moments (J + 1, ...) at the ends of its steps to linearise about; None: the filter's moments.
-        record: recorded output; ``nodes`` of the result is a `NodeRecord` for `Record.LINEARIZATION`.
-    """
-    ssm, _, grid, shared = problem
-    dynamics, transition = problem.dynamics, shared.transition(interval)
-    is_exact = ssm.has_constant_coefficients
-    has_nodes = record is Record.LINEARIZATION and grid.tolerance is None and not is_exact
-    if record is Record.LINEARIZATION and not has_nodes:
-        record = Record.SMOOTHER
-
-    def integrate() -> Prediction:
-        if grid.tolerance is not None:
-            return predict_interval_adaptively(dynamics, grid.steps, grid.tolerance, interval.span, interval.length,
-                                               moments, record)
-        return collect(predict_interval(dynamics, transition, grid.steps, interval.span, interval.length, moments,
-                                        about, record))
-
-    def keep_moments() -> Prediction:
-        return collect(identity_prediction(dynamics, moments, record, grid.steps))
-
-    def collect(prediction: Prediction) -> Prediction:
-        return _collect_nodes(problem, interval, prediction) if has_nodes else prediction
-
-    if is_exact:
-        prediction = predict_exact(ssm, shared.linear, transition, grid.steps, interval.span, interval.length, moments)
-    elif grid.replicated:
-        prediction = jax.lax.cond(interval.length > 0, integrate, keep_moments)
-    else:
-        prediction = integrate()
-    has_map = record is Record.SMOOTHER or is_exact
-    if shared.jumps is not None:
-        prediction = apply_jump(prediction, jump_map(ssm, shared.jumps, interval.jump), has_map)
-    return prediction if interval.state_map is None else apply_event(prediction, interval.state_map, has_map)
-
-
-def _collect_nodes(problem: FilterProblem, interval: Intervals, prediction: Prediction) -> Prediction:
-    """Reduce the recorded steps to a `NodeRecord`, and set phi of the interval, jumps at its end included."""
-    ssm = problem.ssm
-    steps: StepRecord = prediction.nodes
-    to_end = jnp.eye(ssm.state_dim)
-    if problem.shared.jumps is not None:
-        to_end, _ = jump_map(ssm, problem.shared.jumps, interval.jump)
-    if interval.state_map is not None and interval.state_map.keep is not None:
-        to_end = interval.state_map.keep[:, None] * to_end
-
-    def previous_step(to_end: jax.Array, step: tuple) -> tuple[jax.Array, jax.Array]:
-        covariance, phi = step
-        return matmul(to_end, phi), matmul(covariance, to_end.T)
-
-    phi, cross = jax.lax.scan(previous_step, to_end, (steps.covariance, steps.phi), reverse=True)
-    covariance = columns(steps.covariance, linearization_indices(ssm, problem.rule))
-    return prediction._replace(phi=phi, nodes=NodeRecord(Moments(steps.mean, covariance), cross))
-
-
 def maps_about(problem: FilterProblem, points: LinearizationPoints | None) -> IntervalMaps | None:
     """Return the affine maps of all intervals of a model that is linearised about given points.
 
@@ -257,8 +172,8 @@ def maps_about(problem: FilterProblem, points: LinearizationPoints | None) -> In
     transition is tabulated, while the noise is integrated anew in each pass. A linear model is linearised about no
     points.
     """
-    ssm, rule, grid, _ = problem
-    if ssm.time_invariant or grid.tolerance is not None:
+    ssm, rule = problem.ssm, problem.rule
+    if ssm.plan.has_exact_noise or problem.integrator.stepping is Stepping.ADAPTIVE:
         return None
 
     def interval_map(inputs: tuple[Intervals, Moments | None]) -> IntervalMaps:

@@ -10,11 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD
 from lfm_ppl.model.state_space import Span, StateSpaceModel, inset
-
-RUNGE_KUTTA, EXPONENTIAL = METHODS = "runge-kutta", "exponential"
-"""Methods of integration: explicit, and A-stable for stiff dynamics."""
-
 
 _BLOCK = 128
 """Largest number of intervals whose transitions are computed at once."""
@@ -75,7 +72,7 @@ class TimeGrid(NamedTuple):
         initial_time: start of the scan.
         replicated: whether intervals of length zero are so many that a branch around their prediction is faster.
         tolerance: of the error of an adaptive step, in standard deviations; None for ``steps`` equal steps.
-        method: of integration, one of `METHODS`.
+        method: of integration, one of `lfm_ppl.filtering.integrators.methods.METHODS`.
         since: (N,) starts of the intervals, counted from the initial time, so that small differences of large times
             keep all their digits.
     """
@@ -89,7 +86,7 @@ class TimeGrid(NamedTuple):
     initial_time: Any
     replicated: bool = False
     tolerance: float | None = None
-    method: str = RUNGE_KUTTA
+    method: str = DEFAULT_METHOD
     since: Any = None
 
 

@@ -31,9 +31,10 @@ import jax.numpy as jnp
 
 from lfm_ppl.filtering.backward import SmootherTrace, at_interval_starts, backward
 from lfm_ppl.filtering.dynamics import columns, linearization_indices
-from lfm_ppl.filtering.forward import FilterTrace, LinearizationPoints, NodeRecord, forward
+from lfm_ppl.filtering.forward import FilterTrace, LinearizationPoints, forward
 from lfm_ppl.filtering.moments import Moments, Record, matvec
-from lfm_ppl.filtering.problem import FilterProblem, is_affine, is_observation_nonlinear
+from lfm_ppl.filtering.predict import NodeRecord
+from lfm_ppl.filtering.problem import FilterProblem
 from lfm_ppl.filtering.update import Updater
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -84,7 +85,7 @@ def number_of_iterations(iterations: int | None, ssm: StateSpaceModel, tolerance
     if iterations is not None:
         return iterations
     is_family = isinstance(ssm.model.observation, ObservationFamily)
-    return 0 if is_family or tolerance is not None or is_affine(ssm) else DEFAULT_ITERATIONS
+    return 0 if is_family or tolerance is not None or ssm.plan.is_linear else DEFAULT_ITERATIONS
 
 
 def posterior_linearisation(problem: FilterProblem, updater: Updater, iterations: int,
@@ -198,7 +199,7 @@ def smoothed_points(problem: FilterProblem, trace: FilterTrace, smoothed: Smooth
         return Moments(moments.mean + matvec(cross, r), moments.covariance - congruence(cross, adjoint))
 
     end_moments = None
-    if is_observation_nonlinear(ssm):
+    if not ssm.plan.has_exact_update:
         end_moments = jax.vmap(smooth_row)(trace.predicted, trace.predicted.covariance, r, adjoint)
 
     def marginal(moments: Moments) -> tuple[Moments, jax.Array]:

@@ -1,8 +1,8 @@
 """The problem that all passes of a filter share: a model, a rule, a time grid, and what is computed once for all.
 
-`filter_problem` tabulates the transitions of the linear part for the distinct lengths of the intervals, where these are
-few, and takes the constant parts of the Jacobians. Passes of one problem (iterations, sweeps of expectation
-propagation) share them, so that their derivatives are taken once.
+`filter_problem` chooses the integrator of the model, lets it tabulate what depends on the length of an interval only,
+where distinct lengths are few, and takes the constant parts of the Jacobians. Passes of one problem (iterations, sweeps
+of expectation propagation) share them, so that their derivatives are taken once.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.dynamics import Dynamics
+from lfm_ppl.filtering.integrators.integrator import Integrator, Stepping
+from lfm_ppl.filtering.integrators.methods import choose_integrator
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, by_length, with_state_maps, with_transitions
 from lfm_ppl.filtering.moments import Moments
-from lfm_ppl.filtering.predict import interval_factor
-from lfm_ppl.filtering.transition import LinearPart, constant_jacobian, exact, linear_part
+from lfm_ppl.filtering.transition import LinearPart, constant_jacobian, linear_part
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.state_space import StateSpaceModel
 
@@ -36,23 +37,23 @@ class SharedTransitions(NamedTuple):
     Attributes:
         linear: the constant linear part of the dynamics.
         observation_jacobian: (D, M + R), the constant part of the observation's Jacobian.
-        transition: maps an interval to its exact transition, or to the integrating factor of its steps; to None where
-            the steps follow a tolerance.
+        table: maps an interval to what the integrator tabulates for its length.
         jumps: G and Q of the forces' jumps; None without any.
     """
 
     linear: LinearPart
     observation_jacobian: jax.Array
-    transition: Callable[[Intervals], Any]
+    table: Callable[[Intervals], Any]
     jumps: tuple[jax.Array, jax.Array] | None
 
 
 class FilterProblem(NamedTuple):
-    """A model, a rule and a time grid, with what all intervals share."""
+    """A model, a rule, a time grid and the integrator that they need, with what all intervals share."""
 
     ssm: StateSpaceModel
     rule: Rule
     grid: TimeGrid
+    integrator: Integrator
     shared: SharedTransitions
 
     @property
@@ -63,7 +64,7 @@ class FilterProblem(NamedTuple):
     @property
     def dynamics(self) -> Dynamics:
         """Model, rule and linear part, as a prediction needs them."""
-        return Dynamics(self.ssm, self.rule, self.shared.linear, self.grid.method)
+        return Dynamics(self.ssm, self.rule, self.shared.linear)
 
     def initial(self, initial: Moments | None = None) -> Moments:
         """Return moments at the initial time, by default the model's."""
@@ -72,25 +73,22 @@ class FilterProblem(NamedTuple):
 
 def filter_problem(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> FilterProblem:
     """Compute what all intervals share."""
+    integrator = choose_integrator(ssm, rule, grid.method, grid.tolerance)
     linear = linear_part(ssm, jnp.asarray(grid.initial_time, float))
     count = np.shape(grid.intervals.length)[0]
     is_tabulated = grid.lengths is not None and len(grid.lengths) <= max(_FEW_LENGTHS, count // _INTERVALS_PER_LENGTH)
 
-    def transition(length: jax.Array) -> Any:
-        if ssm.has_constant_coefficients:
-            return exact(ssm, length, grid.steps, linear)
-        if grid.tolerance is not None:
-            return None
-        return interval_factor(ssm, rule, linear, length, grid.steps, is_tabulated)
+    def tabulate(length: jax.Array) -> Any:
+        return integrator.tabulate(Dynamics(ssm, rule, linear), length, grid.steps, is_tabulated)
 
     grid = with_state_maps(ssm, grid)
-    if grid.lengths is None and ssm.has_constant_coefficients:
-        grid = with_transitions(grid, transition)
-        transition_of: Callable[[Intervals], Any] = operator.attrgetter("transition")
+    if grid.lengths is None and integrator.stepping is Stepping.NONE:
+        grid = with_transitions(grid, tabulate)
+        table: Callable[[Intervals], Any] = operator.attrgetter("transition")
     else:
-        transition_of = by_length(grid, transition)
-    shared = SharedTransitions(linear, _observation_jacobian(ssm, grid), transition_of, ssm.stack.jump_table())
-    return FilterProblem(ssm, rule, grid, shared)
+        table = by_length(grid, tabulate)
+    shared = SharedTransitions(linear, _observation_jacobian(ssm, grid), table, ssm.stack.jump_table())
+    return FilterProblem(ssm, rule, grid, integrator, shared)
 
 
 def _observation_jacobian(ssm: StateSpaceModel, grid: TimeGrid) -> jax.Array:
@@ -98,22 +96,6 @@ def _observation_jacobian(ssm: StateSpaceModel, grid: TimeGrid) -> jax.Array:
     t = jnp.asarray(grid.initial_time, float)
     w = ssm.inputs(ssm.initial()[0], t)
     return constant_jacobian(lambda v: (ssm.observe(v, t), ()), w, ssm.observation_structure, ssm.output_dim)
-
-
-def is_observation_nonlinear(ssm: StateSpaceModel) -> bool:
-    """Return whether the linearisation of an observation depends on the moments about which it is made."""
-    observation = ssm.model.observation
-    return bool(not ssm.observation_structure.linear or observation.angular or observation.varies_with_state)
-
-
-def is_linear(ssm: StateSpaceModel) -> bool:
-    """Return whether no pass depends on the moments about which the model is linearised."""
-    return ssm.drift_structure.linear and ssm.observation_structure.linear
-
-
-def is_affine(ssm: StateSpaceModel) -> bool:
-    """Return whether dynamics and observation are affine in states and forces, with noise independent of them."""
-    return is_linear(ssm) and not is_observation_nonlinear(ssm)
 
 
 def at_intervals(tree: Any, intervals: Any) -> Any:

@@ -27,7 +27,8 @@ from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.filter import whitened_innovations
 from lfm_ppl.filtering.forward import FilterTrace, forward
-from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid
+from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS
+from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.iterated import number_of_iterations, posterior_linearisation
 from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
@@ -167,7 +168,7 @@ def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
 def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule | None = None, steps: int = 10,
            max_step: float | None = None, at: ArrayLike | None = None, iterations: int | None = None,
            damping: float = 0.7, tolerance: float | None = None, sites: SiteSettings | str | None = None,
-           method: str = RUNGE_KUTTA) -> SmootherResult:
+           method: str = DEFAULT_METHOD) -> SmootherResult:
     """Smooth: the state and the forces given all observations.
 
         m_s = m + G (m_s+ - m_p),  P_s = (I - G Phi) P (I - G Phi)' + G (Q + P_s+) G',  G = P Phi' P_p^-1.

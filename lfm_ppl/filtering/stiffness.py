@@ -27,8 +27,8 @@ import numpy as np
 import scipy.linalg
 
 from lfm_ppl.filtering.breakdown import FilterWarning
-from lfm_ppl.filtering.dynamics import is_nonlinear_in_forces_only
-from lfm_ppl.filtering.intervals import EXPONENTIAL, Intervals, TimeGrid, as_arrays, with_state_maps
+from lfm_ppl.filtering.integrators.methods import choose_integrator
+from lfm_ppl.filtering.intervals import Intervals, TimeGrid, as_arrays, with_state_maps
 from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -103,15 +103,6 @@ class LongStep(NamedTuple):
     is_linear: bool
 
 
-def has_explicit_steps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid) -> bool:
-    """Return whether the filter takes explicit steps of fixed length; adaptive ones are shortened by their error.
-
-    Where only the forces enter non-linearly, no state is integrated explicitly (`lfm_ppl.filtering.simpson`).
-    """
-    is_explicit = grid.method != EXPONENTIAL and grid.tolerance is None and not ssm.has_constant_coefficients
-    return bool(ssm.physical_dim) and is_explicit and not is_nonlinear_in_forces_only(ssm, rule)
-
-
 def explicit_steps(ssm: StateSpaceModel, grid: TimeGrid, filtered_mean: jax.Array,
                    initial_mean: jax.Array | None = None) -> ExplicitSteps:
     """Follow the mean from the filtered means (T, n), and record the Jacobian of the explicit part.
@@ -179,9 +170,10 @@ def warn_of_long_steps(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, steps: 
         log_likelihood: result of the filter, of any shape.
         initial_mean: (n,), at the initial time; None: the model's.
     """
-    if checks.traced((ssm, grid, log_likelihood, initial_mean)) or not has_explicit_steps(ssm, rule, grid):
+    if checks.traced((ssm, grid, log_likelihood, initial_mean)):
         return
-    if not np.isfinite(np.asarray(log_likelihood)).all():
+    is_explicit = choose_integrator(ssm, rule, grid.method, grid.tolerance).is_explicit
+    if not is_explicit or not np.isfinite(np.asarray(log_likelihood)).all():
         return
     mean = filtered_mean() if callable(filtered_mean) else filtered_mean
     warn_of_message(long_step_message(_compiled_explicit_steps(ssm, grid, mean, initial_mean), ssm.model.state_names,

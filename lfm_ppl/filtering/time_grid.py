@@ -94,7 +94,7 @@ def lay_out_time_grid(ssm: StateSpaceModel, times: Any, steps: int, max_step: fl
     concrete_times = check_times(times, initial_time)
     start = concrete_times[0] if initial_time is None and concrete_times is not None else initial_time
     origin = None if start is None else checks.concrete(start)
-    is_adaptive = tolerance is not None and not ssm.has_constant_coefficients
+    is_adaptive = tolerance is not None and not ssm.plan.has_exact_transition
     if concrete_times is None and _refuses_traced_times.get():
         raise ValueError("a time grid of traced times differs from that of their values.")
     if concrete_times is None or origin is None:
@@ -137,8 +137,8 @@ def _concrete_layout(ssm: StateSpaceModel, times: np.ndarray, origin: float, req
     division = replace(
         division, breakpoints=breakpoints, traced_breakpoints=len(traced_breakpoints) + int(events.is_traced.sum()),
         scale=0.0 if checks.traced(scale) else scale,
-        overhead=OVERHEAD_OF_EXACT if ssm.time_invariant else OVERHEAD,
-        is_exact=ssm.mean_invariant and division.max_step is None and not division.interval_per_step)
+        overhead=OVERHEAD_OF_EXACT if ssm.plan.has_exact_noise else OVERHEAD,
+        is_exact=ssm.plan.has_exact_offset and division.max_step is None and not division.interval_per_step)
     check_start(events.times[~np.asarray(events.is_past(events.times))], origin)
     grid = _divide_times(times, origin, ssm.stack.jump_times, requested, division, events)
     is_lagged = tuple(checks.traced(read.breakpoints()) for read in reads)

@@ -194,7 +194,7 @@ def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPar
     t = jnp.zeros(())
     linear = linear_part(ssm, t) if linear is None else linear
     matrix, shift = ssm.input_map(t)
-    constant = jnp.zeros(total).at[:size].set(ssm.drift(shift, t)) if ssm.mean_invariant else jnp.zeros(total)
+    constant = jnp.zeros(total).at[:size].set(ssm.drift(shift, t)) if ssm.plan.has_exact_offset else jnp.zeros(total)
     lin = feedback(ssm, linear)
     dispersion = ssm.model.process_noise
     is_constant = dispersion is not None and not callable(dispersion)
@@ -210,7 +210,7 @@ def exact(ssm: StateSpaceModel, length: jax.Array, steps: int, linear: LinearPar
     phi = phi.at[..., size:total, size:total].set(forces)
     process_cov = process_cov.at[..., size:total, size:total].set(force_cov) if size else process_cov
     inputs = None
-    if not ssm.mean_invariant:
+    if not ssm.plan.has_exact_offset:
         weights_of = functools.partial(input_weights, ssm, linear)
         inputs = (jax.vmap(weights_of) if is_block else weights_of)(length / steps)
     return Exact(phi[..., :total, :total], process_cov[..., :total, :total], phi[..., :total, total], inputs)

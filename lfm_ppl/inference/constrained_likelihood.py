@@ -27,7 +27,7 @@ from lfm_ppl.constrained.full_information import check_settings
 from lfm_ppl.filtering.backward import backward
 from lfm_ppl.filtering.ep.evidence import entry_leave_one_out
 from lfm_ppl.filtering.ep.settings import SiteSettings
-from lfm_ppl.filtering.intervals import RUNGE_KUTTA
+from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD
 from lfm_ppl.filtering.moments import Record
 from lfm_ppl.filtering.problem import at_intervals
 from lfm_ppl.filtering.smoother import SmootherResult
@@ -219,7 +219,7 @@ def likelihood_with(model: LatentForceModel, times: Any, settings: Mapping[str, 
     for name in ("max_step", "tolerance"):
         if settings.get(name) is not None:
             raise ValueError(f"{name} is not supported under constraints, which add rows to the grid; raise steps.")
-    if (method := settings.get("method", RUNGE_KUTTA)) != RUNGE_KUTTA:
+    if (method := settings.get("method", DEFAULT_METHOD)) != DEFAULT_METHOD:
         raise ValueError(f"method={method!r} is not supported under constraints; leave method out.")
     if settings.get("iterations"):
         raise ValueError("under constraints a non-linear model is always linearised about smoothed moments. Leave "

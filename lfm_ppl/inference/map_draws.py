@@ -17,6 +17,7 @@ from typing import Any, Protocol, cast
 import jax
 import numpy as np
 
+from lfm_ppl.filtering.integrators.integrator import Stepping
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.utils.batching import BATCH_SIZE, mapped, on_cpu, side_by_side, threads
 from lfm_ppl.utils.programs import Program
@@ -70,7 +71,8 @@ def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable, draws: M
     draws = {site: np.asarray(value) for site, value in draws.items()}
     count = next(iter(draws.values())).shape[0]
     example = bound.site.example
-    is_vectorized = rows is not None and (example.tolerance is None or example.ssm.has_constant_coefficients)
+    is_adaptive = any(integrator.stepping is Stepping.ADAPTIVE for integrator in example.integrators)
+    is_vectorized = rows is not None and not is_adaptive
     batch, parallel = _batch_size(count, rows, example.ssm.state_dim, is_vectorized)
 
     def sequential(draws: Any, keys: jax.Array, *arguments: Any) -> Any:

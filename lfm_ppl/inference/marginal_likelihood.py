@@ -23,7 +23,7 @@ from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.evidence import Evidence, evidence
 from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
-from lfm_ppl.filtering.intervals import EXPONENTIAL, METHODS, RUNGE_KUTTA
+from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS
 from lfm_ppl.filtering.iterated import number_of_iterations
 from lfm_ppl.inference.series_likelihood import SeriesLikelihood, check_model, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
@@ -103,7 +103,7 @@ class MarginalLikelihood(SeriesLikelihood):
     def __init__(self, model: LatentForceModel, times: ArrayLike, rule: Rule | None = None, steps: int = 10,
                  max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
                  tolerance: float | None = None, sites: SiteSettings | str | None = None, *,
-                 method: str = RUNGE_KUTTA, validate_args: bool | None = None, **unknown: Any):
+                 method: str = DEFAULT_METHOD, validate_args: bool | None = None, **unknown: Any):
         for name in unknown:
             remedy = "; constraints are arguments of lfm.ConstrainedLikelihood" if name in CONSTRAINTS else ""
             raise TypeError(f"MarginalLikelihood has no argument {name!r}{remedy}.")
@@ -132,10 +132,10 @@ class MarginalLikelihood(SeriesLikelihood):
         """How the likelihood is computed: exact or by which approximation."""
         if self.is_family:
             return f"approximate (sites by {self.sites_in_words})"
-        if self.is_affine:
-            if self.ssm.is_integrated_exactly:
+        if self.ssm.plan.is_linear:
+            if self.ssm.plan.has_exact_moments:
                 return "exact (the model is linear)"
-            if self.ssm.has_constant_coefficients:
+            if self.ssm.plan.has_exact_transition:
                 ignored = "" if self.tolerance is None else "; tolerance has no effect"
                 return f"exact transitions, known inputs integrated in {self.steps} steps between two times{ignored}"
             return "linear model, integrated " + (f"in {self.steps} steps between two times" if self.tolerance is None
@@ -157,8 +157,8 @@ class MarginalLikelihood(SeriesLikelihood):
         if not self.is_family:
             return ""
         settings = self.site_settings
-        is_linear = not (self.ssm.drift_structure.nonlinear or self.ssm.observation_structure.nonlinear)
-        return settings.method + ("" if is_linear else f", linearised at most {settings.relinearisations} times")
+        count = f", linearised at most {settings.relinearisations} times"
+        return settings.method + ("" if self.ssm.plan.is_linear else count)
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return the log marginal likelihood of ``value`` (T, D), NaN where missing; batch dimensions may lead."""
@@ -208,7 +208,7 @@ class MarginalLikelihood(SeriesLikelihood):
         """Return physical states (*sample_shape, T, M) and observations (*sample_shape, T, D); see `sample`."""
         initial_time, times = self.time_grid.initial_time, checks.concrete(self.times)
         steps, breakpoints = SIMULATION_STEPS * self.steps, input_breakpoints(self.model, times, initial_time)
-        program = SimulationProgram(self.ssm, steps, breakpoints, self.method == EXPONENTIAL)
+        program = SimulationProgram(self.ssm, steps, breakpoints, self.is_stiff)
         lengths = checks.concrete(self.time_grid.intervals.length)
         if times is not None and lengths is not None and not checks.traced(initial_time):
             if self.tolerance is None:

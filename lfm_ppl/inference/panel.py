@@ -19,7 +19,7 @@ from numpyro.distributions import constraints
 
 from lfm_ppl.filtering.arguments import as_rule
 from lfm_ppl.filtering.ep.settings import SiteSettings
-from lfm_ppl.filtering.intervals import RUNGE_KUTTA
+from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD
 from lfm_ppl.filtering.stiffness import long_step_message, warn_of_message
 from lfm_ppl.inference.constrained_likelihood import likelihood_with
 from lfm_ppl.inference.likelihood import Likelihood
@@ -200,7 +200,8 @@ class Panel(Likelihood):
 
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayLike, rule: Rule | None = None,
           steps: int = 10, max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
-          tolerance: float | None = None, sites: SiteSettings | str | None = None, method: str = RUNGE_KUTTA) -> Panel:
+          tolerance: float | None = None, sites: SiteSettings | str | None = None,
+          method: str = DEFAULT_METHOD) -> Panel:
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.
 
     The plate's name is the dimension of the series in the result of `lfm_ppl.fit`; `lfm_ppl.select_series` returns one

@@ -105,7 +105,7 @@ def _plan_of(series: SeriesLikelihood, times: np.ndarray, requested_times: np.nd
                     for row in np.atleast_2d(times)) if simulated else fine
         return PathPlan(None, rows, rows, steps)
     beyond = np.array([])
-    needs_steps = simulated or not series.ssm.mean_invariant or len(series.ssms) > 1
+    needs_steps = simulated or not series.ssm.plan.has_exact_offset or len(series.ssms) > 1
     if needs_steps and requested_times.max() > times[-1] and (gaps > 0).any():
         gap = np.median(gaps[gaps > 0])
         count = min(int(np.ceil((requested_times.max() - times[-1]) / gap * (1 - 1e-12))), LONGEST_FORECAST)

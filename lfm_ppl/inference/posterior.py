@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.grid_layout import GridLayout, padded_size
-from lfm_ppl.filtering.intervals import EXPONENTIAL
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
@@ -126,7 +125,7 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
     at = None if at is None else np.asarray(at, float)
     if at is not None and np.array_equal(at, bound.times):
         at = None
-    is_stiff = bound.site.example.method == EXPONENTIAL
+    is_stiff = bound.site.example.is_stiff
     settings = particles, particle_steps
     paths = _paths(key, bound, draws, at, settings, is_stiff, report=report, store=store)
     if _PRODUCT not in paths:
@@ -158,7 +157,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
     # In compiled code the noise may be traced, so that rows cannot be compared.
     has_row_noise = has_noise_of_rows(bound)
     is_forecast = None
-    if particles is None and example.has_gaussian_state and example.ssm.drift_structure.nonlinear:
+    if particles is None and example.has_gaussian_state and not example.ssm.plan.has_normal_states:
         is_forecast = has_forecast(bound, requested_times)
     is_shared = particles is None and bound.problem.has_traced_inputs
     count = None if requested_times is None else requested_times.shape[-1]
@@ -213,7 +212,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
         results |= {"state": w[requested, :size], "force": w[requested, size:], "output": output[requested]}
         mean = output[requested]
         variance = jnp.zeros_like(mean)
-        if smoothed is not None and _normal_outputs(ssm):
+        if smoothed is not None and ssm.plan.has_normal_outputs:
             # The normal distribution of y given the parameters, much sharper than given a path.
             matrix = jax.vmap(jax.jacfwd(ssm.observe))(smoothed.input_mean[requested], when[requested])
             spread = jnp.einsum("kdi,kij,kdj->kd", matrix, smoothed.input_covariance[requested], matrix)
@@ -307,7 +306,7 @@ def _points(ssm: StateSpaceModel, smoothed: SmootherResult, w: jax.Array, when: 
     A point has the same coordinates, in units of the distribution, at all times, so that it moves smoothly. Where a
     path is simulated, all points are on the path. ``with_noise`` adds the standard deviations of Gaussian noise.
     """
-    nonlinear = isinstance(ssm.model.observation, ObservationFamily) or not _normal_outputs(ssm)
+    nonlinear = isinstance(ssm.model.observation, ObservationFamily) or not ssm.plan.has_normal_outputs
     if not (nonlinear or ssm.model.deterministic_names):
         return {}
     requested = plan.requested
@@ -354,12 +353,6 @@ def has_noise_of_rows(bound: BoundModel) -> bool:
     is_of_series = not example.ssm.model.observation.varies_with_state and np.ndim(
         example.ssm.model.observation.covariance) == 3
     return any(map(noise_of_rows, bound.site.members if is_of_series else [example]))
-
-
-def _normal_outputs(ssm: StateSpaceModel) -> bool:
-    """Return whether y is normal where the state is: a linear observation with noise that does not depend on it."""
-    observation = ssm.model.observation
-    return not (ssm.observation_structure.nonlinear or observation.varies_with_state or observation.angular)
 
 
 def _particle_path(distribution: SeriesLikelihood, y: jax.Array, requested_times: Any, key: jax.Array,

@@ -27,11 +27,13 @@ from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.filter import FilterResult, filter_on
 from lfm_ppl.filtering.forward import forward
 from lfm_ppl.filtering.grid_layout import GridLayout
-from lfm_ppl.filtering.intervals import RUNGE_KUTTA, TimeGrid
+from lfm_ppl.filtering.integrators.integrator import Integrator
+from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS, choose_integrator
+from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.iterated import posterior_linearisation
-from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem, is_affine
+from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
 from lfm_ppl.filtering.smoother import SmootherResult, filtered_mean, smooth_on
-from lfm_ppl.filtering.stiffness import ExplicitSteps, explicit_steps, has_explicit_steps, warn_of_long_steps
+from lfm_ppl.filtering.stiffness import ExplicitSteps, explicit_steps, warn_of_long_steps
 from lfm_ppl.filtering.time_grid import build_time_grid, lay_out_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.inference.likelihood import Likelihood
@@ -65,7 +67,7 @@ class SeriesLikelihood(Likelihood):
     iterations: int = 0
     damping: float = 0.7
     tolerance: float | None = None
-    method: str = RUNGE_KUTTA
+    method: str = DEFAULT_METHOD
     sites: SiteSettings | None = None
     layout: GridLayout | None = None
     regime_names: tuple[str, ...] = ()
@@ -138,11 +140,6 @@ class SeriesLikelihood(Likelihood):
         return filter_problem(self.ssm, self.rule, self.time_grid)
 
     @property
-    def is_affine(self) -> bool:
-        """Whether dynamics and observation are affine in states and forces, with noise independent of them."""
-        return is_affine(self.ssm)
-
-    @property
     def is_family(self) -> bool:
         """Whether the observation is a family such as `lfm_ppl.PoissonObservation`, and not Gaussian."""
         return isinstance(self.model.observation, ObservationFamily)
@@ -151,6 +148,16 @@ class SeriesLikelihood(Likelihood):
     def ssms(self) -> tuple[StateSpaceModel, ...]:
         """The state-space models of all regimes; one but for a likelihood with several."""
         return (self.ssm,)
+
+    @property
+    def integrators(self) -> tuple[Integrator, ...]:
+        """The integrators of all regimes; one but for a likelihood with several."""
+        return tuple(choose_integrator(ssm, self.rule, self.method, self.tolerance) for ssm in self.ssms)
+
+    @property
+    def is_stiff(self) -> bool:
+        """Whether the method of integration is one for stiff dynamics, so that simulated steps are exponential, too."""
+        return not METHODS[self.method].is_explicit
 
     @property
     def has_gaussian_state(self) -> bool:
@@ -176,7 +183,7 @@ class SeriesLikelihood(Likelihood):
     def recorded_settings(self) -> dict[str, Any]:
         """Settings of the filter as a result records them; what is None is not stored."""
         return {"rule": self.rule.name, "steps": self.steps, "max_step": self.max_step, "iterations": self.iterations,
-                "tolerance": self.tolerance, "method": None if self.method == RUNGE_KUTTA else self.method}
+                "tolerance": self.tolerance, "method": None if self.method == DEFAULT_METHOD else self.method}
 
     @property
     def site_settings(self) -> SiteSettings:
@@ -238,7 +245,7 @@ class SeriesLikelihood(Likelihood):
     @property
     def has_explicit_steps(self) -> bool:
         """Whether a filter takes explicit steps of fixed length, see `lfm_ppl.filtering.stiffness`."""
-        return any(has_explicit_steps(ssm, self.rule, self.time_grid) for ssm in self.ssms)
+        return any(integrator.is_explicit for integrator in self.integrators)
 
     def explicit_steps(self, y: jax.Array, requested_times: Any = None) -> ExplicitSteps | None:
         """Return what limits the explicit steps of the filter of ``y`` (T, D); None where there are none.

@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.breakdown import FilterWarning
-from lfm_ppl.filtering.intervals import METHODS, RUNGE_KUTTA, TimeGrid, with_state_maps
+from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS
+from lfm_ppl.filtering.intervals import TimeGrid, with_state_maps
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.stiffness import (
     ExplicitSteps,
     explicit_steps,
-    has_explicit_steps,
     long_step_message,
     warn_of_message,
 )
@@ -138,7 +138,7 @@ class Switching(SeriesLikelihood):
 
     def __init__(self, models: Mapping[str, LatentForceModel], rates: ArrayLike, times: ArrayLike,
                  rule: Rule | None = None, steps: int = 10, max_step: float | None = None, *,
-                 initial: ArrayLike | None = None, merging: str = "gpb2", method: str = RUNGE_KUTTA) -> None:
+                 initial: ArrayLike | None = None, merging: str = "gpb2", method: str = DEFAULT_METHOD) -> None:
         checks.one_of("merging", merging, MERGINGS)
         checks.one_of("method", method, METHODS)
         by_name = check_models(models)
@@ -213,11 +213,10 @@ class Switching(SeriesLikelihood):
         probability, moments, _ = filter_regimes(self.regimes(grid), y).filtered
         mean = jnp.einsum("nkm,nkmi->ni", probability, moments.mean)[jnp.asarray(grid.observed)]
         steps = []
-        for ssm in self.ssms:
+        for ssm, integrator in zip(self.ssms, self.integrators, strict=True):
             limits = explicit_steps(ssm, grid, mean)
             # A regime that is integrated exactly has no step.
-            is_explicit = has_explicit_steps(ssm, self.rule, grid)
-            steps.append(limits if is_explicit else limits._replace(step=jnp.zeros_like(limits.step)))
+            steps.append(limits if integrator.is_explicit else limits._replace(step=jnp.zeros_like(limits.step)))
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *steps)
 
     def _warn_of_long_steps(self, grid: TimeGrid, steps: int, y: jax.Array, log_likelihood: jax.Array) -> None:

@@ -25,6 +25,7 @@ import numpy as np
 from lfm_ppl.forces.sde import Stack, block_diagonal
 from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.model.events import StateMap, state_maps
+from lfm_ppl.model.integration_plan import IntegrationPlan, integration_plan
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.structure import Pattern, pattern
 from lfm_ppl.utils import checks
@@ -44,6 +45,7 @@ class StateSpaceModel(eqx.Module):
         observation_structure: structure of h as a function of w.
         constant_measurement: whether K does not depend on time.
         constant_mean: whether k does not depend on time.
+        plan: what is exact, what is integrated in steps, and what is linearised.
     """
 
     model: LatentForceModel
@@ -52,6 +54,7 @@ class StateSpaceModel(eqx.Module):
     observation_structure: InputStructure = eqx.field(static=True)
     constant_measurement: bool = eqx.field(static=True)
     constant_mean: bool = eqx.field(static=True)
+    plan: IntegrationPlan = eqx.field(static=True)
 
     @property
     def physical_dim(self) -> int:
@@ -130,27 +133,6 @@ class StateSpaceModel(eqx.Module):
         """Return the maps of the joint state at the events of the model, see `lfm_ppl.model.events.state_maps`."""
         return state_maps(self.model.events, self.model.state_names, self.state_dim)
 
-    @property
-    def has_constant_coefficients(self) -> bool:
-        """Whether the dynamics is linear, and only additive terms of the mean and the dispersion depend on time."""
-        uses_forces = any(any(row[self.physical_dim:]) for row in self.drift_structure.jacobian)
-        return self.drift_structure.linear and (self.constant_measurement or not uses_forces)
-
-    @property
-    def time_invariant(self) -> bool:
-        """Whether the model is linear with constant coefficients, except for additive terms in the mean."""
-        return self.has_constant_coefficients and not callable(self.model.process_noise)
-
-    @property
-    def is_integrated_exactly(self) -> bool:
-        """Whether the moments are exact: linear, with inputs at most quadratic in time between their breakpoints."""
-        return self.mean_invariant or (self.has_constant_coefficients and self.model.has_quadratic_inputs)
-
-    @property
-    def mean_invariant(self) -> bool:
-        """Whether the model is time-invariant and the additive terms of the mean are constant, too."""
-        return self.time_invariant and not self.drift_structure.offset_varies and self.constant_mean
-
 
 def state_space(model: LatentForceModel) -> StateSpaceModel:
     """Return the state-space model of a latent force model, with the structure of its functions.
@@ -179,12 +161,11 @@ def state_space(model: LatentForceModel) -> StateSpaceModel:
         names = (*model.state_names, *model.force_names)
         declared = tuple(names.index(name) for name in model.nonlinear_inputs)
         _check_declared(on_inputs(model.dynamics), declared, names, drift)
-    return StateSpaceModel(
-        model, stack,
+    structures = (
         _classify(drift, extra, declared), _classify(observe, varying, None),
         not pattern(lambda v: jnp.ravel(stack.measurement(v[0])), 1).jacobian.any(),
-        not pattern(lambda v: stack.mean_at(v[0]), 1).jacobian.any(),
-    )
+        not pattern(lambda v: stack.mean_at(v[0]), 1).jacobian.any())
+    return StateSpaceModel(model, stack, *structures, integration_plan(model, *structures))
 
 
 def _dependence(function: Callable[[jax.Array], jax.Array], total: int) -> tuple[int, ...]:

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lfm_ppl.filtering.integrators.exact import exact_offset
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, as_arrays
-from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.transition import exact
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
@@ -193,7 +193,7 @@ def _choose_method(ssm: StateSpaceModel, method: str, scheme: str) -> tuple[str,
     if scheme not in ("auto", "exact", "euler"):
         raise ValueError(f'backward simulation moves particles by the scheme "exact" or "euler", got {scheme!r}.')
     if scheme == "auto":
-        scheme = "exact" if ssm.time_invariant else "euler"
+        scheme = "exact" if ssm.plan.has_exact_noise else "euler"
     return BACKWARD, choose_scheme(ssm, scheme)
 
 
@@ -203,7 +203,7 @@ def _missing_density_reason(ssm: StateSpaceModel) -> str:
         return "a force jumps"
     if ssm.model.events:
         return "the model has events"
-    if ssm.time_invariant:
+    if ssm.plan.has_exact_noise:
         noise = exact(ssm, jnp.ones(()), 1).process_cov
         return "" if _is_regular(noise) else "not every state of this linear model has noise"
     time = 0.0 if ssm.model.initial_time is None else ssm.model.initial_time

@@ -25,8 +25,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.filtering.integrators.exact import exact_offset
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, by_length
-from lfm_ppl.filtering.predict import exact_offset
 from lfm_ppl.filtering.transition import Exact, exact
 from lfm_ppl.forces.discretise import discretise
 from lfm_ppl.model.state_space import Span, StateSpaceModel
@@ -68,12 +68,12 @@ def choose_scheme(ssm: StateSpaceModel, scheme: str) -> str:
     noise = ssm.model.process_noise
     is_additive = not callable(noise) or not _has_state_dependent_noise(ssm)
     if scheme == "auto":
-        if ssm.time_invariant:
+        if ssm.plan.has_exact_noise:
             return "exact"
         if is_additive:
             return "srk"
         return "milstein" if _noise_sources(ssm) == 1 else "euler"
-    if scheme == "exact" and not ssm.time_invariant:
+    if scheme == "exact" and not ssm.plan.has_exact_noise:
         raise ValueError('scheme "exact" is for linear time-invariant models; use "auto".')
     if scheme == "srk" and not is_additive:
         raise ValueError('scheme "srk" needs additive noise, but process_noise depends on the state or on a force; '

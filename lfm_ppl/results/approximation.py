@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from lfm_ppl.filtering.integrators.integrator import Stepping
 from lfm_ppl.filtering.iterated import DEFAULT_ITERATIONS
 from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
@@ -59,7 +60,7 @@ class Refinement:
 
 def more_iterations(example: SeriesLikelihood) -> Refinement | None:
     """Return more iterations of posterior linearisation; None where the likelihood takes none."""
-    if example.has_sites or example.is_affine or not example.has_gaussian_state:
+    if example.has_sites or example.ssm.plan.is_linear or not example.has_gaussian_state:
         return None
     current = example.iterations
     count = DEFAULT_ITERATIONS if current < DEFAULT_ITERATIONS else max(_MANY_ITERATIONS, 2 * current)
@@ -69,7 +70,7 @@ def more_iterations(example: SeriesLikelihood) -> Refinement | None:
 
 def shorter_steps(example: SeriesLikelihood) -> Refinement | None:
     """Return half the integration step; None where nothing is integrated, or where constraints fix the steps."""
-    if isinstance(example, ConstrainedLikelihood) or all(ssm.is_integrated_exactly for ssm in example.ssms):
+    if isinstance(example, ConstrainedLikelihood) or all(ssm.plan.has_exact_moments for ssm in example.ssms):
         return None
     settings = likelihoods.finer_steps(example)
     arguments = ", ".join(f"{name}={value:g}" for name, value in settings.items())
@@ -131,8 +132,8 @@ def _long_steps(likelihood: SeriesLikelihood) -> list[str]:
     length = checks.concrete(grid.intervals.length)
     lengthscales = [float(force.lengthscale) for force in jax.tree_util.tree_leaves(
         likelihood.model.forces, is_leaf=lambda part: isinstance(part, Stretched)) if isinstance(force, Stretched)]
-    is_exact = likelihood.tolerance is not None or all(ssm.has_constant_coefficients for ssm in likelihood.ssms)
-    if is_exact or length is None or not lengthscales:
+    has_equal_steps = any(integrator.stepping is Stepping.EQUAL for integrator in likelihood.integrators)
+    if not has_equal_steps or length is None or not lengthscales:
         return []
     step, longest = float(length.max()) / grid.steps, 0.5 * min(lengthscales)
     if step <= longest:

@@ -20,7 +20,7 @@ import numpy as np
 
 from lfm_ppl.filtering.ep import importance
 from lfm_ppl.filtering.ep.settings import as_settings
-from lfm_ppl.filtering.problem import filter_problem, is_linear, is_observation_nonlinear
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
@@ -145,7 +145,7 @@ def is_exact(ssm: StateSpaceModel) -> bool:
     Dynamics and observation are linear then, with constant coefficients and Gaussian noise.
     """
     is_family = isinstance(ssm.model.observation, ObservationFamily)
-    return ssm.has_constant_coefficients and not is_family and not is_observation_nonlinear(ssm)
+    return ssm.plan.has_exact_transition and ssm.plan.has_exact_update and not is_family
 
 
 def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods", **settings: Any) -> np.ndarray:
@@ -214,7 +214,7 @@ def on_grid(problem: LikelihoodProblem, settings: ReferenceSettings) -> Referenc
 
 def takes_smoother_draws(ssm: StateSpaceModel) -> bool:
     """Whether draws of the smoother, weighted, estimate the likelihood: linear, with an observation family."""
-    return isinstance(ssm.model.observation, ObservationFamily) and is_linear(ssm)
+    return isinstance(ssm.model.observation, ObservationFamily) and ssm.plan.is_linear
 
 
 def by_particles(problem: LikelihoodProblem, settings: ReferenceSettings, noise: Callable[[np.ndarray], float],

@@ -39,9 +39,10 @@ import numpy as np
 from jax.scipy.special import ndtr, ndtri
 
 from lfm_ppl.filtering.backward import SmootherTrace, backward
-from lfm_ppl.filtering.forward import FilterTrace, predict, update_at_end
+from lfm_ppl.filtering.forward import FilterTrace, update_at_end
 from lfm_ppl.filtering.intervals import TimeGrid, as_arrays, with_observations
 from lfm_ppl.filtering.moments import Moments, Prediction, Record, matvec
+from lfm_ppl.filtering.predict import predict
 from lfm_ppl.filtering.problem import FilterProblem
 from lfm_ppl.filtering.sample import sample_errors
 from lfm_ppl.filtering.update import GaussianUpdate, Update

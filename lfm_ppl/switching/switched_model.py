@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.filter import FilterState
-from lfm_ppl.filtering.forward import predict
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid
 from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.predict import predict
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.forces.shared_state import in_state_of, structure_of

@@ -7,10 +7,13 @@ import pytest
 from systems import whole_state
 
 import lfm_ppl as lfm
-from lfm_ppl.filtering import predict
-from lfm_ppl.filtering.dynamics import Dynamics, is_nonlinear_in_forces_only
+from lfm_ppl.filtering.dynamics import Dynamics
+from lfm_ppl.filtering.integrators.exact import ExactTransition
+from lfm_ppl.filtering.integrators.integrator import Section
+from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, choose_integrator
+from lfm_ppl.filtering.integrators.quadrature import Quadrature
+from lfm_ppl.filtering.integrators.runge_kutta import RungeKutta
 from lfm_ppl.filtering.moments import Moments, Record
-from lfm_ppl.filtering.predict import interval_factor, predict_interval
 from lfm_ppl.filtering.transition import linear_part
 from lfm_ppl.model.state_space import Span
 
@@ -77,15 +80,19 @@ def nodes(ssm, steps):
     return Moments(mean, (0.3 + 0.2 * wave**2)[:, None, None] * (jnp.eye(ssm.state_dim) + 0.1))
 
 
-def predictions(ssm, rule, steps):
+def integrator_of(ssm, rule=None):
+    return choose_integrator(ssm, lfm.Cubature() if rule is None else rule, DEFAULT_METHOD, None)
+
+
+def predictions(integrator, ssm, rule, steps):
     """Of a row from all starts, about the filter's own moments and about given ones."""
-    linear = linear_part(ssm, jnp.zeros(()))
-    factor = interval_factor(ssm, rule, linear, jnp.asarray(1.5), steps, is_tabulated=steps != 3)
+    dynamics, length = Dynamics(ssm, rule, linear_part(ssm, jnp.zeros(()))), jnp.asarray(1.5)
+    table = integrator.tabulate(dynamics, length, steps, is_shared=steps != 3)
 
     def row(moments, about):
-        span = Span.between(0.7, 2.2, 1.5)
-        return [predict_interval(Dynamics(ssm, rule, linear), factor, steps, span, jnp.asarray(1.5), moments, about,
-                                 record) for record in (Record.SMOOTHER, Record.LINEARIZATION)]
+        interval = Section(Span.between(0.7, 2.2, 1.5), length, moments, about)
+        return [integrator.predict(dynamics, table, interval, steps, record)
+                for record in (Record.SMOOTHER, Record.LINEARIZATION)]
 
     def both(moments):
         return row(moments, None), row(moments, nodes(ssm, steps))
@@ -96,13 +103,11 @@ def predictions(ssm, rule, steps):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("steps", [1, 3, 10])
-def test_simpson_gives_the_numbers_of_runge_kutta(name, steps, monkeypatch):
+def test_simpson_gives_the_numbers_of_runge_kutta(name, steps):
     ssm = case(name)
     rule = RULES["taylor" if name == "softplus" and steps == 3 else "cubature"]
-    assert is_nonlinear_in_forces_only(ssm, rule)
-    result = predictions(ssm, rule, steps)
-    monkeypatch.setattr(predict, "is_nonlinear_in_forces_only", lambda *_: False)
-    expected = predictions(ssm, rule, steps)
+    assert integrator_of(ssm, rule) == Quadrature()
+    result, expected = (predictions(integrator, ssm, rule, steps) for integrator in (Quadrature(), RungeKutta()))
     for one, other in zip(*map(jax.tree_util.tree_leaves, (result, expected)), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(other).max(initial=0.0))
 
@@ -114,36 +119,26 @@ def test_other_structures_keep_runge_kutta(dynamics):
     model = lfm.LatentForceModel(dynamics, {"u": lfm.Matern(1.0, 1.0)},
                                  lfm.GaussianObservation(whole_state, jnp.ones(1)),
                                  lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
-    assert not is_nonlinear_in_forces_only(lfm.state_space(model), lfm.Cubature())
+    assert integrator_of(lfm.state_space(model)) == RungeKutta()
 
 
 def test_points_in_the_whole_state_keep_runge_kutta():
-    assert not is_nonlinear_in_forces_only(case("softplus"), lfm.Cubature(full_state=True))
+    assert integrator_of(case("softplus"), lfm.Cubature(full_state=True)) == RungeKutta()
     noisy = lfm.LatentForceModel(one_force(1, jnp.exp), {"u": lfm.Matern(1.0, 1.0)},
                                  lfm.GaussianObservation(whole_state, jnp.ones(1)),
                                  lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
                                  process_noise=lambda x, u, t: x[None])
-    assert not is_nonlinear_in_forces_only(lfm.state_space(noisy), lfm.Cubature())
+    assert integrator_of(lfm.state_space(noisy)) == RungeKutta()
 
 
 @pytest.mark.slow
-def test_without_forces(monkeypatch):
+def test_without_forces():
     """Linear dynamics with a noise that varies with time: there are no nodes to linearise about."""
-    def varying():
-        return lfm.LatentForceModel(
-            lambda x, u, t: jnp.cos(t) - x, {}, lfm.GaussianObservation(whole_state, jnp.array([0.1])),
-            lfm.Gaussian(jnp.ones(1), jnp.eye(1)), process_noise=lambda x, u, t: (1.0 + t) * jnp.ones((1, 1)))
-
-    model, same = varying(), varying()  # of functions of their own, in which nothing is compiled yet
-    assert is_nonlinear_in_forces_only(lfm.state_space(model), lfm.Cubature())
-
-    def log_likelihoods(model):
-        return [lfm.MarginalLikelihood(model, np.arange(4.0), steps=3, iterations=count).log_prob(jnp.ones((4, 1)))
-                for count in (0, 2)]
-
-    result = log_likelihoods(model)
+    model = lfm.LatentForceModel(
+        lambda x, u, t: jnp.cos(t) - x, {}, lfm.GaussianObservation(whole_state, jnp.array([0.1])),
+        lfm.Gaussian(jnp.ones(1), jnp.eye(1)), process_noise=lambda x, u, t: (1.0 + t) * jnp.ones((1, 1)))
+    assert integrator_of(lfm.state_space(model)) == ExactTransition()
+    once, twice = (lfm.MarginalLikelihood(model, np.arange(4.0), steps=3, iterations=count).log_prob(jnp.ones((4, 1)))
+                   for count in (0, 2))
+    np.testing.assert_allclose(once, twice, rtol=1e-12)
     assert lfm.smooth(model, np.arange(4.0), np.ones((4, 1)), at=[0.5, 3.5], steps=3, iterations=2).mean.shape == (2, 1)
-    asked = []
-    monkeypatch.setattr(predict, "is_nonlinear_in_forces_only", lambda *_: bool(asked.append(None)))
-    np.testing.assert_allclose(result, log_likelihoods(same), rtol=1e-12)
-    assert asked, "compiled anew, without Simpson's rule"

@@ -72,7 +72,7 @@ def coefficient_covariances(kind, boundary, dimension, modes=3):
     pytest.param("heat", "dirichlet", 2, marks=pytest.mark.slow)])
 def test_equals_dense_algebra(kind, boundary, dimension):
     basis, _, model = equation(kind, boundary, dimension)
-    assert lfm.state_space(model).mean_invariant, "it takes exact transitions"
+    assert lfm.state_space(model).plan.has_exact_offset, "it takes exact transitions"
     y = np.random.default_rng(0).normal(size=(len(TIMES), 3))
     y[1, 2] = np.nan
     seen = np.isfinite(y).ravel()

@@ -13,8 +13,8 @@ import scipy.linalg
 from scipy import stats
 
 import lfm_ppl as lfm
-from lfm_ppl.filtering.forward import predict
 from lfm_ppl.filtering.moments import Moments, Record
+from lfm_ppl.filtering.predict import predict
 from lfm_ppl.switching.chain import MarkovChain, transition_matrices
 from lfm_ppl.switching.regimes import filter_path, filter_regimes, sample_regimes
 

@@ -53,7 +53,7 @@ from lfm_ppl.filtering.ep.terms import EntryTerms, FamilyTerms
 from lfm_ppl.filtering.forward import FilterTrace, IntervalMaps, LinearizationPoints, forward, maps_about
 from lfm_ppl.filtering.iterated import smoothed_points
 from lfm_ppl.filtering.moments import Moments, Record, matvec
-from lfm_ppl.filtering.problem import FilterProblem, at_intervals, is_linear
+from lfm_ppl.filtering.problem import FilterProblem, at_intervals
 from lfm_ppl.filtering.update import Sites, SiteUpdate, Updater
 from lfm_ppl.utils.linalg import diagonal, inverse_and_log_det, matmul
 
@@ -134,7 +134,7 @@ def refine(problem: FilterProblem, terms: EntryTerms, settings: SiteSettings, in
     Where the sites of a non-linear model do not converge, the result has the sites of assumed density filtering,
     without negative precisions: with them a variance could be negative about other points.
     """
-    if is_linear(problem.ssm):
+    if problem.ssm.plan.is_linear:
         maps = maps_about(problem, None)
         if first is None:
             assert isinstance(terms, FamilyTerms)

@@ -18,20 +18,31 @@ and the classical Runge-Kutta method integrates (m, Phi, W):
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.dynamics import Congruence, DriftLinearization, Dynamics, covariance_of, linearize_drift
-from lfm_ppl.filtering.moments import Moments, Prediction
-from lfm_ppl.filtering.transition import IntegratingFactor
-from lfm_ppl.model.state_space import Span
-from lfm_ppl.utils.linalg import congruence, matmul, outer_square, safe_sqrt, symmetric
+from lfm_ppl.filtering.dynamics import (
+    Congruence,
+    DriftLinearization,
+    Dynamics,
+    covariance_of,
+    linearize_drift,
+    minimum_sd,
+)
+from lfm_ppl.filtering.integrators.integrator import Attempt, RepeatedStep, Section
+from lfm_ppl.filtering.moments import Moments, Prediction, Record
+from lfm_ppl.filtering.transition import IntegratingFactor, integrating_factor
+from lfm_ppl.utils.linalg import congruence, diagonal, fastest_rate, matmul, outer_square, safe_sqrt, symmetric
 
 WEIGHTS = np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
 """Weights of the four stages, in units of the step."""
+
+_STABILITY_LIMIT = 10.0
+"""Longest attempt, in units of one over the fastest rate: steps are unstable from 2.8 on and overflow far above."""
 
 
 class FourthStage(NamedTuple):
@@ -41,22 +52,58 @@ class FourthStage(NamedTuple):
     covariance: jax.Array
 
 
-def runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, span: Span, h: jax.Array, moments: Moments,
-                     min_sd: jax.Array, about: Moments | None = None,
-                     stage1: DriftLinearization | None = None) -> tuple[Prediction, FourthStage]:
-    """Predict over one step of length ``h`` from the start of ``span``.
+@dataclass(frozen=True)
+class RungeKutta(RepeatedStep):
+    """The classical Runge-Kutta method.
+
+    Where the fifth stage, which is the next step's first, replaces the fourth, the formula has order three. The
+    difference of the two results, e = h (k_4 - k_5) / 6, estimates the error of a step at no cost.
+    """
+
+    is_explicit: ClassVar[bool] = True
+    error_order: ClassVar[int] = 4
+
+    def step(self, dynamics: Dynamics, table: Any, step: Section, min_sd: jax.Array) -> Prediction:
+        """Predict over one step."""
+        return _runge_kutta_step(dynamics, table, step, min_sd)[0]
+
+    def attempts(self, dynamics: Dynamics, interval: Section,
+                 record: Record) -> tuple[DriftLinearization, Callable[[Section, Any], Attempt]]:
+        """Return the linearised dynamics at the start of an interval, and the function (step, stage) -> `Attempt`."""
+        ssm, span = dynamics.ssm, interval.span
+        factor_of_interval = integrating_factor(ssm, dynamics.linear, interval.length)
+        min_sd = minimum_sd(dynamics, factor_of_interval, span.time(), interval.length, interval.moments)
+
+        def linearize_at(t: jax.Array, moments: Moments) -> DriftLinearization:
+            return linearize_drift(dynamics, t, moments.mean, covariance_of(moments), min_sd)
+
+        def attempt(step: Section, stage: Any) -> Attempt:
+            factor = integrating_factor(ssm, dynamics.linear, step.length)
+            prediction, stage4 = _runge_kutta_step(dynamics, factor, step, min_sd, stage)
+            stage5 = linearize_at(step.span.time(step.length), prediction.moments)
+            error = jax.tree.map(_larger, _stage_error(step.length, prediction.moments, stage4, stage5),
+                                 _linear_part_error(dynamics, factor, step, stage))
+            return Attempt(prediction, error, stage5)
+
+        return linearize_at(span.time(), interval.moments), attempt
+
+    def longest_step(self, stage: Any) -> jax.Array | None:
+        """Return the longest step that stays finite where it is rejected, with its derivative, which is not used."""
+        return _STABILITY_LIMIT / fastest_rate(stage.jacobian)
+
+
+def _runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, step: Section, min_sd: jax.Array,
+                      stage1: DriftLinearization | None = None) -> tuple[Prediction, FourthStage]:
+    """Predict over one step.
 
     Args:
         dynamics: the model and the rule.
         factor: the integrating factor of the step.
-        span: times from the start of the step on.
-        h: length of the step.
-        moments: at the start of the step.
+        step: the step.
         min_sd: see `lfm_ppl.filtering.dynamics.minimum_sd`.
-        about: moments (3, ...) at start, middle and end of the step to linearise about; None: the filter's moments.
         stage1: the first stage, where it is known from the step before.
     """
-    m, p = moments
+    span, h, (m, p), about = step
     size = dynamics.ssm.physical_dim
     half, full, back_half, back_full = factor.half, factor.full, factor.back_half, factor.back_full
     half_x, full_x = half[:size], full[:size]
@@ -78,7 +125,7 @@ def runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, span: Span, 
         return state[:, :-1], state[:, -1]
 
     if stage1 is None:
-        stage1 = linearize_stage(0, span.time(), m, covariance_of(moments))
+        stage1 = linearize_stage(0, span.time(), m, covariance_of(step.moments))
     k1 = increment(stage1, identity)
     phi2, m2 = add_increment(to_half, 0.5 * h * matmul(half[:size, :size], k1))
 
@@ -184,3 +231,44 @@ def process_cov_at(factor: IntegratingFactor, stage: int, transports: jax.Array,
         state_cov = state_cov + (weights[:, None, None] * congruence(transports[:, :, :size], diffusions)).sum(0)
     return jnp.concatenate([jnp.concatenate([state_cov, cross], axis=1),
                             jnp.concatenate([cross.T, exact], axis=1)])
+
+
+def _stage_error(h: jax.Array, end: Moments, stage4: FourthStage, stage5: DriftLinearization) -> Moments:
+    """Return the estimated errors of the mean (M,) and of the rows (M, n) of the covariance at the end of a step."""
+    size = stage5.remainder.shape[0]
+    mean = stage4.drift.remainder - stage5.remainder
+    covariance = matmul(stage4.drift.jacobian, stage4.covariance) - matmul(stage5.jacobian, end.covariance)
+    covariance = covariance.at[:, :size].add(covariance[:, :size].T)
+    if stage5.diffusion is not None and stage4.drift.diffusion is not None:
+        covariance = covariance.at[:, :size].add(stage4.drift.diffusion - stage5.diffusion)
+    return Moments(h / 6 * mean, h / 6 * covariance)
+
+
+def _linear_part_error(dynamics: Dynamics, factor: IntegratingFactor, step: Section,
+                       stage1: DriftLinearization) -> Moments:
+    """Return the errors of the mean (M,) and the covariance (M, n) due to a fast linear part.
+
+    The step replaces the integral of exp(A s) r ds, of the remainder r of the dynamics, by Simpson's rule W r. Its
+    error e obeys A e = A W r - (exp(A h) - 1) r, and each row of e is about that over the state's own rate. The noise D
+    obeys the same with A D + D A'.
+    """
+    size, h = dynamics.ssm.physical_dim, step.length
+    matrix = dynamics.linear.rows[:, :size]
+    full, half, identity = factor.full[:size, :size], factor.half[:size, :size], jnp.eye(size)
+    remainder = jnp.concatenate([matmul(stage1.jacobian, step.moments.covariance), stage1.remainder[:, None]], axis=1)
+    residual = matmul(h / 6 * matmul(matrix, full + 4.0 * half + identity) - (full - identity), remainder)
+    rate = jnp.abs(diagonal(matrix))
+    error = residual / (rate + 1.0 / h)[:, None]
+    covariance = error[:, :-1].at[:, :size].add(error[:, :size].T)
+    if stage1.diffusion is not None:
+        at_start = congruence(full, stage1.diffusion)
+        noise = h / 6 * (at_start + 4.0 * congruence(half, stage1.diffusion) + stage1.diffusion)
+        drift = matmul(matrix, noise)
+        noise_residual = drift + drift.T - (at_start - stage1.diffusion)
+        covariance = covariance.at[:, :size].add(noise_residual / (rate[:, None] + rate + 1.0 / h))
+    return Moments(error[:, -1], covariance)
+
+
+def _larger(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return the entry of the larger modulus."""
+    return jnp.where(jnp.abs(a) >= jnp.abs(b), a, b)

@@ -14,19 +14,30 @@ r"""Prediction over an interval in which the dynamics is non-linear in the force
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.dynamics import DriftLinearization, Dynamics, is_autonomous, linearize_drift
-from lfm_ppl.filtering.moments import Moments, Prediction, matvec, transform
-from lfm_ppl.filtering.runge_kutta import WEIGHTS, process_cov_at, stack_diffusions
-from lfm_ppl.filtering.transition import IntegratingFactor
+from lfm_ppl.filtering.dynamics import DriftLinearization, Dynamics, linearize_drift, minimum_sd
+from lfm_ppl.filtering.integrators.integrator import (
+    EqualSteps,
+    Section,
+    StepRecord,
+    advance,
+    insert_midpoints,
+    start_of_steps,
+)
+from lfm_ppl.filtering.integrators.runge_kutta import WEIGHTS, process_cov_at, stack_diffusions
+from lfm_ppl.filtering.moments import Moments, Prediction, Record, matvec, transform
+from lfm_ppl.filtering.transition import IntegratingFactor, integrating_factor
 from lfm_ppl.forces.sde import block_diagonal
-from lfm_ppl.model.state_space import Span
 from lfm_ppl.utils.linalg import congruence, matmul
+
+_LARGEST_TABULATED = 8
+"""Largest number of force states whose transitions to all nodes of an interval are tabulated; others are chained."""
 
 _FIRST_MIDDLE_LAST = slice(None, -2, 2), slice(1, None, 2), slice(2, None, 2)
 """First, middle and last node of each of J steps, among the 2 J + 1 nodes."""
@@ -44,7 +55,7 @@ class _Node(NamedTuple):
     diffusion: jax.Array | None
 
 
-class StepMap(NamedTuple):
+class _StepMap(NamedTuple):
     """The affine map of one step about the mean m at its start, with the transition E(h) of the linear part.
 
     It is s -> E(h) m + (offset, 0) + phi (s - m) + N(0, process_cov), with an offset (M,).
@@ -55,20 +66,44 @@ class StepMap(NamedTuple):
     process_cov: jax.Array
 
 
-def step_maps(dynamics: Dynamics, factor: IntegratingFactor, steps: int, span: Span, h: jax.Array, moments: Moments,
-              min_sd: jax.Array, about: Moments | None) -> StepMap:
+@dataclass(frozen=True)
+class Quadrature(EqualSteps):
+    """Simpson's rule with exponential weights, where the dynamics is linearised in forces only."""
+
+    error_order: ClassVar[int] = 5
+
+    def tabulate(self, dynamics: Dynamics, length: jax.Array, steps: int, is_shared: bool = False) -> IntegratingFactor:
+        """Return the integrating factor of a step, with the transitions to all nodes where many intervals share it."""
+        has_nodes = is_shared and dynamics.ssm.force_dim <= _LARGEST_TABULATED
+        return integrating_factor(dynamics.ssm, dynamics.linear, length / steps, False, steps if has_nodes else None)
+
+    def predict(self, dynamics: Dynamics, table: Any, interval: Section, steps: int, record: Record) -> Prediction:
+        """Predict over an interval in ``steps`` steps."""
+        h = interval.length / steps
+        min_sd = minimum_sd(dynamics, table, interval.span.time(), h, interval.moments)
+        initial = start_of_steps(interval.moments, record)
+        maps = _step_maps(dynamics, table, interval, h, steps, min_sd)
+
+        def apply(previous: Prediction, step_map: _StepMap) -> tuple[Prediction, StepRecord | None]:
+            return advance(dynamics, previous, _apply_step_map(previous.moments, step_map, table.full), record)
+
+        last, nodes = jax.lax.scan(apply, initial, maps)
+        return last._replace(nodes=nodes)
+
+
+def _step_maps(dynamics: Dynamics, factor: IntegratingFactor, interval: Section, h: jax.Array, steps: int,
+               min_sd: jax.Array) -> _StepMap:
     """Return the maps (J, ...) of the steps of an interval.
 
     Args:
         dynamics: the model and the rule.
         factor: the integrating factor of a step.
-        steps: J.
-        span: the interval's times.
+        interval: the interval.
         h: length of a step.
-        moments: at the interval's start.
+        steps: J.
         min_sd: see `lfm_ppl.filtering.dynamics.minimum_sd`.
-        about: moments (J + 1, ...) at the ends of the steps to linearise about; None: the filter's moments.
     """
+    span, moments, about = interval.span, interval.moments, interval.about
     ssm = dynamics.ssm
     size = ssm.physical_dim
     forces = _force_moments(factor, steps, _forces_of(moments, size), size)
@@ -87,7 +122,7 @@ def step_maps(dynamics: Dynamics, factor: IntegratingFactor, steps: int, span: S
             remainder = remainder + matvec(jacobian, mean - point.mean)
         return _Node(jnp.concatenate([jacobian, remainder[:, None]], axis=1), drift.diffusion)
 
-    if is_autonomous(ssm):
+    if ssm.plan.is_autonomous:
         times = span.time(0.5 * h * jnp.arange(2 * steps + 1))
         nodes = jax.vmap(linearize_node)(times, forces.mean, point)
         first_middle_last = [jax.tree.map(lambda a, part=part: a[part], nodes) for part in _FIRST_MIDDLE_LAST]
@@ -101,7 +136,7 @@ def step_maps(dynamics: Dynamics, factor: IntegratingFactor, steps: int, span: S
     return jax.vmap(lambda *nodes: _simpson_step(factor, h, nodes, size))(*first_middle_last)
 
 
-def apply_step_map(moments: Moments, step_map: StepMap, full: jax.Array) -> Prediction:
+def _apply_step_map(moments: Moments, step_map: _StepMap, full: jax.Array) -> Prediction:
     """Return the prediction over one step; ``full`` is E(h), the transition of the linear part."""
     size = step_map.offset.shape[0]
     mean = matvec(full, moments.mean)
@@ -133,14 +168,7 @@ def _by_node(a: jax.Array) -> jax.Array:
     return jnp.stack([a[part] for part in _FIRST_MIDDLE_LAST])
 
 
-def insert_midpoints(step_ends: jax.Array) -> jax.Array:
-    """Return the ends (J + 1, ...) of steps with their midpoints in between, (2 J + 1, ...)."""
-    middles = 0.5 * (step_ends[:-1] + step_ends[1:])
-    pairs = jnp.stack([step_ends[:-1], middles], axis=1)
-    return jnp.concatenate([pairs.reshape(2 * len(middles), *step_ends.shape[1:]), step_ends[-1:]])
-
-
-def _simpson_step(factor: IntegratingFactor, h: jax.Array, nodes: tuple[_Node, ...], size: int) -> StepMap:
+def _simpson_step(factor: IntegratingFactor, h: jax.Array, nodes: tuple[_Node, ...], size: int) -> _StepMap:
     """Return the map of a step from its first, middle and last node.
 
     The middle node is both the second and the third Runge-Kutta stage; their Z, where Psi~ = I - Z is the inverse
@@ -170,4 +198,4 @@ def _simpson_step(factor: IntegratingFactor, h: jax.Array, nodes: tuple[_Node, .
     process_cov = process_cov_at(factor, -1, transports, diffusions, h * WEIGHTS, size)
     if factor.state_noise is not None:
         process_cov = process_cov.at[:size, :size].add(factor.state_noise)
-    return StepMap(jnp.concatenate([transports[0], full[size:]]), offset, process_cov)
+    return _StepMap(jnp.concatenate([transports[0], full[size:]]), offset, process_cov)

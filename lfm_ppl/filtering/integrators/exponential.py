@@ -22,17 +22,19 @@ Source: Blanes and Moan (2006), Applied Numerical Mathematics 56(12), for the in
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.dynamics import Dynamics, covariance_of, is_autonomous, linearize_drift
-from lfm_ppl.filtering.moments import Moments, Prediction, compose, matvec, transform
-from lfm_ppl.filtering.transition import feedback
+from lfm_ppl.filtering.dynamics import Dynamics, covariance_of, linearize_drift, minimum_sd
+from lfm_ppl.filtering.integrators.integrator import Attempt, RepeatedStep, Section
+from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose, matvec, transform
+from lfm_ppl.filtering.transition import feedback, integrating_factor
 from lfm_ppl.forces.discretise import discretise_driven
-from lfm_ppl.model.state_space import Span
 from lfm_ppl.utils.linalg import outer_square
 
 
@@ -67,20 +69,44 @@ _SECOND_HALF = LinearSDE(*np.array([[-2, 8, 6], [-1, 8, 5], [0, -12, 12], [0, 8,
 _TO_MIDDLE = LinearSDE(*np.array([[5, 8, -1], [5, 8, -1], [-12, 12, 0], [6, 6, 0]]) / 12)
 
 
-def exponential_step(dynamics: Dynamics, span: Span, h: jax.Array, moments: Moments, min_sd: jax.Array,
-                     about: Moments | None = None) -> tuple[Prediction, Moments | None]:
-    """Predict over one step of length ``h``, and return the estimated error of the moments at its end, too.
+@dataclass(frozen=True)
+class Exponential(RepeatedStep):
+    """Exponential steps: stable however fast a state decays."""
+
+    error_order: ClassVar[int] = 3
+
+    def step(self, dynamics: Dynamics, table: Any, step: Section, min_sd: jax.Array) -> Prediction:
+        """Predict over one step."""
+        return _exponential_step(dynamics, step, min_sd)[0]
+
+    def attempts(self, dynamics: Dynamics, interval: Section,
+                 record: Record) -> tuple[None, Callable[[Section, Any], Attempt]]:
+        """Return None, because a step needs no stage of the one before, and the function (step, stage) -> `Attempt`."""
+        factor_of_interval = integrating_factor(dynamics.ssm, dynamics.linear, interval.length)
+
+        def attempt(step: Section, stage: Any) -> Attempt:
+            # A fast state settles during the interval.
+            min_sd = minimum_sd(dynamics, factor_of_interval, step.span.time(), step.length, step.moments,
+                                settles=True)
+            prediction, error = _exponential_step(dynamics, step, min_sd)
+            assert error is not None
+            return Attempt(prediction, error)
+
+        return None, attempt
+
+
+def _exponential_step(dynamics: Dynamics, step: Section, min_sd: jax.Array) -> tuple[Prediction, Moments | None]:
+    """Predict over one step, and return the estimated error of the moments at its end, too.
 
     There is no estimate about given moments.
 
     Args:
         dynamics: the model and the rule.
-        span: times from the start of the step on.
-        h: length of the step.
-        moments: at the start of the step.
+        step: the step.
         min_sd: see `lfm_ppl.filtering.dynamics.minimum_sd`.
-        about: moments (3, ...) at start, middle and end of the step to linearise about; None: the filter's moments.
     """
+    span, h, moments, about = step
+
     def linearize_at(node: int, point: Moments) -> LinearSDE:
         return _linear_sde(dynamics, span.time(0.5 * node * h), moments.mean, point, min_sd)
 
@@ -96,7 +122,7 @@ def exponential_step(dynamics: Dynamics, span: Span, h: jax.Array, moments: Mome
         middle = linearize_at(1, midpoint)
         second_order = predict(_flow(middle, h)).moments
         end = linearize_at(2, second_order)
-        if not is_autonomous(dynamics.ssm):
+        if not dynamics.ssm.plan.is_autonomous:
             # XLA removes this where the error is not used.
             deviation = midpoint.mean - moments.mean
             offsets = [matvec(sde.feedback - middle.feedback, deviation) + sde.offset
@@ -106,8 +132,8 @@ def exponential_step(dynamics: Dynamics, span: Span, h: jax.Array, moments: Mome
         nodes = [start, linearize_at(1, predict(_flow(_combine(_TO_MIDDLE, start, middle, end), 0.5 * h)).moments), end]
     first, second = (_flow(_combine(weights, *nodes), 0.5 * h) for weights in (_FIRST_HALF, _SECOND_HALF))
     offset = matvec(second.phi, first.offset) + second.offset
-    step = predict(_Flow(offset, *compose(first[1:], second[1:])))
-    return step, None if about is not None else jax.tree.map(jnp.subtract, step.moments, second_order)
+    prediction = predict(_Flow(offset, *compose(first[1:], second[1:])))
+    return prediction, None if about is not None else jax.tree.map(jnp.subtract, prediction.moments, second_order)
 
 
 def _linear_sde(dynamics: Dynamics, t: jax.Array, origin: jax.Array, point: Moments, min_sd: jax.Array) -> LinearSDE:
