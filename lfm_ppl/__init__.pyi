@@ -2,6 +2,8 @@
 
 from . import forces as forces
 from . import orbits as orbits
+from .accuracy.check_accuracy import check_accuracy as check_accuracy
+from .accuracy.correction import correct_posterior as correct_posterior
 from .constrained.full_information import full_information as full_information
 from .constrained.moving_horizon import MovingHorizon as MovingHorizon
 from .constrained.moving_horizon import moving_horizon as moving_horizon
@@ -23,22 +25,21 @@ from .forces import SquaredExponential as SquaredExponential
 from .forces import WienerVelocity as WienerVelocity
 from .inference.bind import bind as bind
 from .inference.bound_model import BoundModel as BoundModel
-from .inference.constrained_likelihood import ConstrainedLikelihood as ConstrainedLikelihood
-from .inference.handlers.fixing import fix as fix
-from .inference.handlers.on_latent_grid import on_latent_grid as on_latent_grid
 from .inference.kernels.elliptical_slice import EllipticalSlice as EllipticalSlice
 from .inference.kernels.particle_marginal import ParticleMarginalRAM as ParticleMarginalRAM
 from .inference.kernels.ram import RAM as RAM
 from .inference.map import map_estimate as map_estimate
-from .inference.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
-from .inference.panel import panel as panel
-from .inference.switching import Switching as Switching
 from .io import data as data
 from .io.data import read_csv as read_csv
 from .io.data import read_table as read_table
 from .io.data_set import Data as Data
 from .latent_grid.laplace import laplace as laplace
 from .latent_grid.latent_grid import LatentGrid as LatentGrid
+from .likelihoods.constrained_likelihood import ConstrainedLikelihood as ConstrainedLikelihood
+from .likelihoods.handlers.fixing import fix as fix
+from .likelihoods.handlers.on_latent_grid import on_latent_grid as on_latent_grid
+from .likelihoods.marginal_likelihood import MarginalLikelihood as MarginalLikelihood
+from .likelihoods.panel import panel as panel
 from .linearisation.rule import Rule as Rule
 from .linearisation.sigma_points import CentralDifference as CentralDifference
 from .linearisation.sigma_points import Cubature as Cubature
@@ -67,10 +68,8 @@ from .model.simulate import simulate as simulate
 from .model.state_space import state_space as state_space
 from .particles.particle_filter import particle_filter as particle_filter
 from .particles.particle_smoother import particle_smoother as particle_smoother
-from .results.accuracy import check_accuracy as check_accuracy
 from .results.arviz_data import load as load
 from .results.arviz_data import save as save
-from .results.correction import correct_posterior as correct_posterior
 from .results.fields import evaluate_field as evaluate_field
 from .results.html_report import save_report as save_report
 from .results.plots import plot_accuracy as plot_accuracy
@@ -96,6 +95,7 @@ from .switching.rao_blackwellised import rao_blackwellised as rao_blackwellised
 from .switching.rule import SwitchingRule as SwitchingRule
 from .switching.rule import Thermostat as Thermostat
 from .switching.switched_simulation import simulate_switched as simulate_switched
+from .switching.switching_likelihood import Switching as Switching
 from .utils.compilation import fast_loops as fast_loops
 from .workflows.backtest import Backtest as Backtest
 from .workflows.backtest import backtest as backtest

@@ -34,7 +34,8 @@ import pandas as pd
 from numpyro.infer import NUTS
 
 import lfm_ppl as lfm
-from lfm_ppl.results import calibration, plots
+from lfm_ppl.accuracy import calibration
+from lfm_ppl.results import plots
 
 quick = bool(os.environ.get("LFM_QUICK"))
 data_sets = 8 if quick else 240

@@ -15,9 +15,9 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import orbits
+from lfm_ppl.accuracy import calibration
 from lfm_ppl.cli import main
 from lfm_ppl.io import loading
-from lfm_ppl.results import calibration
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"

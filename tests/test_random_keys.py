@@ -9,7 +9,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.forces import SQM
-from lfm_ppl.inference.posterior import trajectories
+from lfm_ppl.inference.trajectories import trajectories
 from tests.random_key_recorder import recorded_keys
 
 TIMES = np.array([0.0, 0.5, 1.0, 1.5, 2.0])

@@ -18,17 +18,18 @@ from pathlib import Path
 from typing import Any
 
 import lfm_ppl
-from lfm_ppl.cli import fit, page, results, session
+from lfm_ppl.accuracy import log_likelihoods
+from lfm_ppl.accuracy.check_accuracy import check_accuracy
+from lfm_ppl.accuracy.correction import correct_posterior
+from lfm_ppl.accuracy.report import GROUP, AccuracyReport
+from lfm_ppl.accuracy.verdict import CORRECT
+from lfm_ppl.cli import fit, folders, pages, session
 from lfm_ppl.cli.fit_arguments import TIME_UNIT
 from lfm_ppl.cli.options import CheckOptions
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
-from lfm_ppl.inference.posterior import evenly_spaced
-from lfm_ppl.results import arviz_data, checkpoint, files, html_report, likelihoods, rebuilding, tables
-from lfm_ppl.results.accuracy import check_accuracy
-from lfm_ppl.results.correction import correct_posterior
-from lfm_ppl.results.report import GROUP, AccuracyReport
+from lfm_ppl.inference.trajectories import evenly_spaced
+from lfm_ppl.results import arviz_data, checkpoint, files, html_report, rebuilding, tables
 from lfm_ppl.results.series import times_of
-from lfm_ppl.results.verdict import CORRECT
 from lfm_ppl.utils import atomic_files
 from lfm_ppl.utils.interruption import INTERRUPTED, interruptible
 
@@ -54,15 +55,15 @@ def run(result: str, options: CheckOptions, line: Sequence[str]) -> int:
     for name in (TABLE, FIGURE) if settled is None else ():
         atomic_files.refuse_existing(path.parent / name, replace)
     html_report.refuse_foreign(path.parent / html_report.NAME, options.overwrite)
-    results.check_writable(path.parent)
+    folders.check_writable(path.parent)
     session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not options.no_cache)
     task = rebuild_fit(posterior, options.model, path)
-    command, resume = page.command_line(line), page.command_line(line, "--resume")
+    command, resume = pages.command_line(line), pages.command_line(line, "--resume")
     with contextlib.ExitStack() as stack:
         folder = None
         if options.correct:
             out = options.out or str(path.parent / CORRECTED)
-            folder = stack.enter_context(results.folder(task.name, out, replace))
+            folder = stack.enter_context(folders.folder(task.name, out, replace))
             checkpoint.check_folder(folder, options.resume, options.overwrite)
         stack.enter_context(interruptible(lambda: f"resume with: {resume}"))
         report = settled or check_accuracy(
@@ -85,7 +86,7 @@ def run(result: str, options: CheckOptions, line: Sequence[str]) -> int:
         elif folder is not None:
             # The report of the result again, with a link to the corrected result.
             status = max(status, _correct(task, report, options, folder, command),
-                         page.update(arviz_data.load(path), path.parent))
+                         pages.update(arviz_data.load(path), path.parent))
             if status != INTERRUPTED:
                 method = "draws weighted by the exact likelihood" if report.reliable else "particle-marginal RAM"
                 print(f"done     the corrected posterior ({method}) is in {folder}")
@@ -114,8 +115,8 @@ def _check_likelihood(task: StoredFit) -> None:
     chains = posterior.sizes["chain"]
     draw_indices, rows = evenly_spaced(chains, posterior.sizes["draw"], 1)
     problem = rebuilding.problem(task.posterior, task.model, model_kwargs=task.keywords).select(rows)
-    log_likelihoods = likelihoods.recorded(problem, likelihoods.gaussian(problem))
-    rebuilding.check_likelihood(task.posterior, log_likelihoods.reshape(chains, len(draw_indices)), draw_indices)
+    values = log_likelihoods.recorded(problem, log_likelihoods.gaussian(problem))
+    rebuilding.check_likelihood(task.posterior, values.reshape(chains, len(draw_indices)), draw_indices)
 
 
 def _write(report: AccuracyReport, posterior: Any, path: Path, command: str) -> int:
@@ -126,7 +127,7 @@ def _write(report: AccuracyReport, posterior: Any, path: Path, command: str) -> 
     stored = arviz_data.add_group(arviz_data.load(path), GROUP, report.to_dataset().assign_attrs(command_line=command))
     print(f"wrote    {arviz_data.save(stored, path, overwrite=True)} (group {GROUP})")
     print(f"wrote    {tables.write_csv(report.table, path.parent / TABLE, overwrite=True)}")
-    return page.draw(plot_accuracy, posterior, path.parent / FIGURE, True) or page.update(stored, path.parent)
+    return pages.draw(plot_accuracy, posterior, path.parent / FIGURE, True) or pages.update(stored, path.parent)
 
 
 def _correct(task: StoredFit, report: AccuracyReport, options: CheckOptions, folder: Path, command: str) -> int:

@@ -102,7 +102,7 @@ def models(model: Model | None = None, /, *, options: Debug = Debug()) -> None:
 @app.command(help_epilogue=_examples("new my_model.py && lfm-ppl fit my_model.py"))
 def new(file: NewFile, /, *, options: Debug = Debug()) -> None:
     """Write a commented model file to start from, which runs as it is."""
-    from lfm_ppl.cli.results import check_writable
+    from lfm_ppl.cli.folders import check_writable
 
     path = Path(file)
     if path.suffix != ".py" or not path.stem.isidentifier():
@@ -224,7 +224,7 @@ def _default(value: Any) -> str:
                                      "plot posterior.nc --out figures --format pdf"))
 def plot(result: Result, /, *, options: PlotOptions = PlotOptions()) -> None:
     """Draw the figures of a saved result again."""
-    from lfm_ppl.cli.results import check_writable
+    from lfm_ppl.cli.folders import check_writable
     from lfm_ppl.results import arviz_data, files, plots
 
     path = files.locate(result)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lfm_ppl.cli import page, results
+from lfm_ppl.cli import folders, pages
 from lfm_ppl.cli.options import StudyOptions
 from lfm_ppl.experiments.catalogue import CatalogueEntry
 from lfm_ppl.experiments.study import StudyResult
@@ -27,8 +27,8 @@ def run(entry: CatalogueEntry, values: Mapping[str, Any], options: StudyOptions,
     report = None if options.quiet else Console()
     workers, study = options.processes.workers, entry.study
     settings = study.settings.from_command_line(report, options.quick, **values)
-    path = Path(options.out or results.FOLDER / "compare" / (f"{entry.name}-quick" if options.quick else entry.name))
-    with results.open_folder(path) as folder:
+    path = Path(options.out or folders.FOLDER / "compare" / (f"{entry.name}-quick" if options.quick else entry.name))
+    with folders.open_folder(path) as folder:
         html_report.refuse_foreign(folder / PAGE, options.overwrite)
         start_time = time.perf_counter()
         result = study.run(settings, folder, overwrite=options.overwrite, report=report, workers=workers)
@@ -41,7 +41,7 @@ def run(entry: CatalogueEntry, values: Mapping[str, Any], options: StudyOptions,
     print(f"\ntime     {duration(time.perf_counter() - start_time)}")
     for path in written:
         print(f"wrote    {path}")
-    return page.report_failure(lambda: _write_page(folder, entry, result, written, page.command_line(line)))
+    return pages.report_failure(lambda: _write_page(folder, entry, result, written, pages.command_line(line)))
 
 
 def _write_page(folder: Path, entry: CatalogueEntry, result: StudyResult, written: list[Path], command: str) -> Path:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 import lfm_ppl
-from lfm_ppl.cli import choices, fit_many, page, results, session
+from lfm_ppl.cli import choices, fit_many, folders, pages, session
 from lfm_ppl.cli.data_file import read_data, read_series, unit_of_file
 from lfm_ppl.cli.fit_arguments import approximated_model, result_attributes, sampling_arguments, without_data
 from lfm_ppl.cli.options import DataOptions, FitArguments
@@ -59,7 +59,7 @@ def run(name: str, options: FitArguments, line: Sequence[str]) -> int:
         checkpoint.check_folder(output.out, output.resume, output.overwrite)
     elif output.resume:
         raise ValueError("--resume continues the run in a folder; name the folder with --out.")
-    with results.folder(model.name, output.out, output.overwrite or output.resume) as folder:
+    with folders.folder(model.name, output.out, output.overwrite or output.resume) as folder:
         is_finished = output.resume and checkpoint.is_finished(folder)
         if output.resume and not is_finished and not checkpoint.has_run(folder):
             print(f"resume   no run to resume in {folder}: this is a new run")
@@ -68,7 +68,7 @@ def run(name: str, options: FitArguments, line: Sequence[str]) -> int:
                 bind(numpyro_model, observed.times, observed.y, **keywords).fix(fixed)
         _print_data(options, model, observed, fixed)
         _print_settings(options, model_options, observed)
-        resume = page.command_line(line, *([] if output.out else ["--out", str(folder)]), "--resume")
+        resume = pages.command_line(line, *([] if output.out else ["--out", str(folder)]), "--resume")
         start_time = time.perf_counter()
         with interruptible(lambda: _remains(folder, resume)):
             posterior = lfm_ppl.fit(
@@ -192,7 +192,7 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
     # A checkpoint has written a partial or complete result under this name.
     written = [arviz_data.save(posterior, folder / files.POSTERIOR, overwrite=True)]
     table, attrs = arviz_data.summary(posterior), arviz_data.attributes(posterior)
-    written.append(tables.write_csv(tables.annotate(table, posterior), folder / results.SUMMARY, overwrite))
+    written.append(tables.write_csv(tables.annotate(table, posterior), folder / folders.SUMMARY, overwrite))
     print(f"\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}\n")
     for message in misfit(posterior):
         print(f"note     {message}")
@@ -213,5 +213,5 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
           + (f", and {duration(earlier)} before it was stopped" if earlier > 0.05 * seconds + 1.0 else ""))
     for path in (*written, *figures):
         print(f"wrote    {path}")
-    return max(status, page.report_failure(
+    return max(status, pages.report_failure(
         lambda: html_report.save_report(posterior, folder / html_report.NAME, overwrite, figures=figures)))

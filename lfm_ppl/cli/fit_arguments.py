@@ -6,11 +6,11 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lfm_ppl.cli import choices, page
+from lfm_ppl.cli import choices, pages
 from lfm_ppl.cli.options import Approximation, FitArguments
-from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
+from lfm_ppl.likelihoods.handlers.settings import approximate
 
 TIME_UNIT = "file_time_unit"
 """Attribute of a result: the unit that --time-unit gave to the times of the data file."""
@@ -79,7 +79,7 @@ def result_attributes(options: FitArguments, line: Sequence[str], model: loading
         "data": options.data.data or "simulated",
         "description": model.description,
         "meanings": json.dumps(dict(model.parameters)),
-        "command_line": page.command_line(line),
+        "command_line": pages.command_line(line),
         **({"note": observed.note} if observed.note else {}),
         **({TIME_UNIT: options.data.time_unit} if options.data.time_unit else {}),
         **({"series_column": options.data.series} if observed.series and options.data.series else {}),

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import lfm_ppl
-from lfm_ppl.cli import choices, results, session
+from lfm_ppl.cli import choices, folders, session
 from lfm_ppl.cli.data_file import read_data, read_series
 from lfm_ppl.cli.fit_arguments import approximated_model, result_attributes, sampling_arguments, without_data
 from lfm_ppl.cli.options import DataOptions, FitArguments
@@ -63,8 +63,8 @@ def run(model_name: str, options: FitArguments, line: Sequence[str]) -> int:
     if not data_sets:
         name, reason = next(iter(failed.items()))
         raise ValueError(f"no data set can be used ({len(failed)} failed). {name}: {reason}")
-    path = Path(options.output.out or results.FOLDER / f"{model.name}-many")
-    with results.open_folder(path) as folder, _pickled_by_value(model, workers):
+    path = Path(options.output.out or folders.FOLDER / f"{model.name}-many")
+    with folders.open_folder(path) as folder, _pickled_by_value(model, workers):
         fits = lfm_ppl.fit_many(
             approximated_model(options, model), data_sets, out=folder, workers=workers, each=arguments,
             progress=not options.output.quiet, **sampling_arguments(options, model))
@@ -87,7 +87,7 @@ def _write(fitted: Any, folder: Path, attributes: dict[str, Any]) -> None:
     fitted.result.attrs.update(attributes)
     arviz_data.save(fitted.result, target / files.POSTERIOR, overwrite=True)
     summary = tables.annotate(arviz_data.summary(fitted.result), fitted.result)
-    tables.write_csv(summary, target / results.SUMMARY, overwrite=True)
+    tables.write_csv(summary, target / folders.SUMMARY, overwrite=True)
     try:
         html_report.save_report(fitted.result, target / html_report.NAME, overwrite=True, figures=[])
     except Exception as error:  # the result is saved

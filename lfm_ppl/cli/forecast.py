@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 import lfm_ppl
-from lfm_ppl.cli import choices, page, results, session
+from lfm_ppl.cli import choices, folders, pages, session
 from lfm_ppl.cli.data_file import output_columns
 from lfm_ppl.cli.fit_arguments import TIME_UNIT
 from lfm_ppl.cli.options import ForecastOptions, Times
@@ -53,7 +53,7 @@ def run(result: str, options: ForecastOptions, line: Sequence[str]) -> int:
     with contextlib.ExitStack() as stack:
         folder = path.parent
         if options.out:
-            folder = stack.enter_context(results.folder("forecast", options.out, options.overwrite))
+            folder = stack.enter_context(folders.folder("forecast", options.out, options.overwrite))
         else:
             for name in (TABLE, FIGURE, *MORE_FIGURES.values(), *([SCORES] if options.held_out else [])):
                 atomic_files.refuse_existing(folder / name, options.overwrite)
@@ -61,12 +61,12 @@ def run(result: str, options: ForecastOptions, line: Sequence[str]) -> int:
             if not options.overwrite and arviz_data.has_group(posterior, GROUP):
                 raise FileExistsError(f"{path} already holds predictions. Write to another folder with --out, or "
                                       "replace them with --overwrite.")
-            results.check_writable(folder)
+            folders.check_writable(folder)
         session.start(1, not options.no_cache)
         task = rebuild_fit(posterior, options.model, path)
         held_out = None if options.held_out is None else _held_out_data(options.held_out, options, task)
         forecast, scores = _forecast(options, task, held_out)
-        group = arviz_data.group(forecast, GROUP).assign_attrs(command_line=page.command_line(line))
+        group = arviz_data.group(forecast, GROUP).assign_attrs(command_line=pages.command_line(line))
         forecast = arviz_data.add_group(forecast, GROUP, group)
         return _write(forecast, scores, task, path, folder, options)
 
@@ -149,10 +149,10 @@ def _write(forecast: Any, scores: pd.DataFrame | None, task: StoredFit, path: Pa
     if scores is not None:
         print(f"\n{tables.text_table(scores, width=shutil.get_terminal_size().columns)}\n")
         print(f"wrote    {tables.write_csv(scores, folder / SCORES, options.overwrite, index_label='output')}")
-    statuses = {name: page.draw(plot, forecast, folder / name, options.overwrite) for name, plot in _figures(forecast)}
+    statuses = {name: pages.draw(plot, forecast, folder / name, options.overwrite) for name, plot in _figures(forecast)}
     more = {} if scores is None else {"Scores on the held-out data": scores}
     paths = [folder / name for name, status in statuses.items() if status == 0]
-    return max(*statuses.values(), page.update(updated, folder, paths, more))
+    return max(*statuses.values(), pages.update(updated, folder, paths, more))
 
 
 def _table(forecast: Any) -> pd.DataFrame:

@@ -69,8 +69,8 @@ def _bind(model: loading.ModelFile) -> Any:
 
 
 def _print_sites(model: loading.ModelFile, bound: Any) -> None:
-    from lfm_ppl.inference.priors import prior, support
-    from lfm_ppl.results.likelihoods import is_exact
+    from lfm_ppl.accuracy.log_likelihoods import is_exact
+    from lfm_ppl.likelihoods.priors import prior, support
 
     trace, example = bound.trace(), bound.site.example
     system = example.ssm.model

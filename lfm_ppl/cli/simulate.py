@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 
-from lfm_ppl.cli import choices, results, session
+from lfm_ppl.cli import choices, folders, session
 from lfm_ppl.cli.options import SimulateOptions
 from lfm_ppl.io import data, loading
 from lfm_ppl.io.truth import write_truth
@@ -17,7 +17,7 @@ def run(name: str, options: SimulateOptions) -> None:
     model_options = choices.options(model, options.option)
     table = atomic_files.refuse_existing(options.out or f"{model.name}.csv", options.overwrite)
     truth_file = atomic_files.refuse_existing(table.with_suffix(".truth.json"), options.overwrite)
-    results.check_writable(table.parent)
+    folders.check_writable(table.parent)
     session.start(1, not options.no_cache)
     simulated = model.simulate(seed=options.seed, **model_options)
     with atomic_files.atomic_write(table, options.overwrite) as temporary:

@@ -20,9 +20,9 @@ from jax.ad_checkpoint import checkpoint_name
 
 from lfm_ppl.filtering.moments import Moments, matvec
 from lfm_ppl.filtering.transition import IntegratingFactor, LinearPart
+from lfm_ppl.linearisation.input_selection import InputStructure
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
-from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils.linalg import congruence, diagonal, fastest_rate, matmul, outer_square
 

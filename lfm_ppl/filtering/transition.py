@@ -32,8 +32,8 @@ from lfm_ppl.forces.discretise import (
     phi_functions,
     scalar_phi_functions,
 )
+from lfm_ppl.linearisation.input_selection import InputStructure
 from lfm_ppl.linearisation.rule import Function, partial_jacobian, selection
-from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils.linalg import congruence, diagonal, matmul, safe_sqrt, solve_semidefinite
 

@@ -22,14 +22,14 @@ from lfm_ppl.filtering.breakdown import warn_of_iterations
 from lfm_ppl.filtering.filter import FilterResult
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.stiffness import ExplicitSteps, long_step_message, warn_of_message
-from lfm_ppl.inference.handlers.fixing import fix
-from lfm_ppl.inference.handlers.settings import approximate
-from lfm_ppl.inference.likelihood import Likelihood
-from lfm_ppl.inference.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood, single_site
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
-from lfm_ppl.inference.panel import Panel
 from lfm_ppl.inference.problem import Partition, Problem, signature
 from lfm_ppl.inference.trace import Programs, TracedModel, trace_model
+from lfm_ppl.likelihoods.handlers.fixing import fix
+from lfm_ppl.likelihoods.handlers.settings import approximate
+from lfm_ppl.likelihoods.likelihood import Likelihood
+from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood, single_site
+from lfm_ppl.likelihoods.panel import Panel
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.random_keys import split_keys

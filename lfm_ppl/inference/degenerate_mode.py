@@ -21,8 +21,8 @@ from numpyro.distributions import constraints
 from numpyro.infer import init_to_median, init_to_sample
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.handlers.pinned import Pinned
 from lfm_ppl.inference.map import MAPResult
+from lfm_ppl.likelihoods.handlers.pinned import Pinned
 from lfm_ppl.utils.random_keys import split_keys
 
 _PRIOR_DRAWS = 256

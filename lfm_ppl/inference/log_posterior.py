@@ -11,7 +11,7 @@ import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.utils.programs import Program
 
 

@@ -13,13 +13,13 @@ import numpy as np
 from numpyro.infer.util import potential_energy
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
-from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.likelihood import Likelihood
 from lfm_ppl.inference.problem import Problem
-from lfm_ppl.inference.switching import Switching
+from lfm_ppl.likelihoods.constrained_likelihood import ConstrainedLikelihood
+from lfm_ppl.likelihoods.handlers.likelihood_handler import LikelihoodHandler
+from lfm_ppl.likelihoods.likelihood import Likelihood
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
+from lfm_ppl.switching.switching_likelihood import Switching
 from lfm_ppl.utils.programs import Program
 
 _TIMES = 16

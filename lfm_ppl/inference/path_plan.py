@@ -18,8 +18,8 @@ import numpy as np
 from lfm_ppl.filtering.division import longest_step
 from lfm_ppl.filtering.time_grid import LONGEST_FORECAST, build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.likelihoods.marginal_likelihood import SIMULATION_STEPS
+from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils import checks
 

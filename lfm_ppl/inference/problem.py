@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,22 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.grid_layout import GridLayout
+from lfm_ppl.likelihoods.likelihood_site import SiteTimes
 from lfm_ppl.utils import checks
 
 _ARRAY, _DATA = object(), object()
 """Mark the place of an array among the static leaves of a partition, and that of the data among the arguments."""
-
-
-class SiteTimes(NamedTuple):
-    """Times of a likelihood site that do not depend on the parameters.
-
-    Attributes:
-        times: (T,), or (B, T) for a panel.
-        layout: layout of the time grid; None where the likelihood lays it out itself.
-    """
-
-    times: Any
-    layout: GridLayout | None = None
 
 
 @dataclass(frozen=True)

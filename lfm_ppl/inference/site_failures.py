@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
-from lfm_ppl.inference.map_draws import map_draws
+from lfm_ppl.inference.draw_batches import map_draws
+from lfm_ppl.likelihoods.constrained_likelihood import ConstrainedLikelihood
 
 POINTS = 100
 """Points at which the likelihood is evaluated."""

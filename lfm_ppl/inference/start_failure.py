@@ -12,9 +12,9 @@ from numpyro.infer import init_to_median
 
 from lfm_ppl.filtering.breakdown import breakdown, family_breakdown
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
-from lfm_ppl.inference.switching import Switching
+from lfm_ppl.likelihoods.constrained_likelihood import ConstrainedLikelihood
+from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
+from lfm_ppl.switching.switching_likelihood import Switching
 
 
 def start_failure(bound: BoundModel) -> str:

@@ -31,10 +31,16 @@ from numpyro.infer.util import constrain_fn, potential_energy
 from numpyro.infer.util import log_density as constrained_log_density
 
 from lfm_ppl.filtering.time_grid import refuse_traced_times
-from lfm_ppl.inference.likelihood_site import LikelihoodSite, likelihood_sites, record_likelihoods, replace_times
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.inference.problem import Problem, SiteTimes, is_numeric, shapes
+from lfm_ppl.inference.problem import Problem, is_numeric, shapes
 from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, latent_sites
+from lfm_ppl.likelihoods.likelihood_site import (
+    LikelihoodSite,
+    SiteTimes,
+    likelihood_sites,
+    record_likelihoods,
+    replace_times,
+)
+from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.utils import checks
 
 _DUPLICATE_NAME = re.compile("unique names but got `(.*)` duplicated")

@@ -286,7 +286,7 @@ def location_in_model(error: BaseException) -> SourceLocation | None:
             if module.startswith(_MODULE):
                 file = frame.f_code.co_filename
                 location = SourceLocation(file, line, Path(file).parent == models_folder())
-            elif module.startswith("lfm_ppl.inference.handlers."):  # an option of the user is at fault
+            elif module.startswith("lfm_ppl.likelihoods.handlers."):  # an option of the user is at fault
                 location = None
         cause = cause.__cause__
     return location

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.linearisation.structure import InputStructure
+from lfm_ppl.linearisation.input_selection import InputStructure
 
 Function = Callable[[jax.Array], tuple[jax.Array, Any]]
 """Maps inputs (N,) to a value (D,) and a pytree of arrays, for which a rule returns the expectation only."""

@@ -29,8 +29,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lfm_ppl.linearisation.input_selection import InputStructure
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
-from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import cholesky, congruence, matmul, outer_square
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from lfm_ppl.linearisation.input_selection import InputStructure
 from lfm_ppl.linearisation.rule import AffineMap, Function, Inputs, Rule, partial_jacobian, selection
-from lfm_ppl.linearisation.structure import InputStructure
 from lfm_ppl.utils.linalg import matmul
 
 

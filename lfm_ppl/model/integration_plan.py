@@ -19,7 +19,7 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 
-from lfm_ppl.linearisation.structure import InputStructure
+from lfm_ppl.linearisation.input_selection import InputStructure
 from lfm_ppl.model.latent_force_model import LatentForceModel
 
 

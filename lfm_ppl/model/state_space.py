@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.forces.sde import Stack, block_diagonal
-from lfm_ppl.linearisation.structure import InputStructure
+from lfm_ppl.linearisation.input_selection import InputStructure
 from lfm_ppl.model.events import StateMap, state_maps
 from lfm_ppl.model.integration_plan import IntegrationPlan, integration_plan
 from lfm_ppl.model.latent_force_model import LatentForceModel

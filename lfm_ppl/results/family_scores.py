@@ -11,9 +11,9 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.map_draws import map_draws
-from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.inference.draw_batches import map_draws
+from lfm_ppl.likelihoods.panel import Panel
+from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results.series import times_of
 

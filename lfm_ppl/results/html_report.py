@@ -25,7 +25,8 @@ import xarray as xr
 from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup
 
-from lfm_ppl.results import arviz_data, predictions, report, tables
+from lfm_ppl.accuracy import report
+from lfm_ppl.results import arviz_data, predictions, tables
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import ORIGIN, input_unit, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import saving

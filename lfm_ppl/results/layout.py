@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.forces.quasi_periodic import QuasiPeriodic
-from lfm_ppl.inference.posterior import LOG_PRIOR
+from lfm_ppl.inference.trajectories import LOG_PRIOR
 from lfm_ppl.io.truth import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
 from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, PERIODS, REGIMES, mixture_quantiles, predictions
@@ -131,7 +131,7 @@ class TrajectoryDraws(NamedTuple):
 
     Attributes:
         draw_index: (S,), draws of each chain that have trajectories.
-        paths: `lfm_ppl.inference.posterior.trajectories`, (C, S, ...); None: no trajectories.
+        paths: `lfm_ppl.inference.trajectories.trajectories`, (C, S, ...); None: no trajectories.
         times: (K,) times of the trajectories; None: the times of the data.
     """
 
@@ -148,7 +148,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
         bound: the model and its data.
         draws: site -> (C, N, ...).
         stats: statistic of the sampler -> (C, N).
-        scores: `lfm_ppl.inference.posterior.scores` of all draws, one chain after another; None: no scores.
+        scores: `lfm_ppl.inference.trajectories.scores` of all draws, one chain after another; None: no scores.
         trajectories: trajectories at some of the draws.
         truth: truth of simulated data.
         labels: names of axes.
@@ -261,7 +261,7 @@ def with_summaries(trajectories: xr.Dataset, paths: Mapping[str, np.ndarray]) ->
 
     Args:
         trajectories: draws of states, forces and outputs, (chain, draw, ..., at, kind).
-        paths: `lfm_ppl.inference.posterior.trajectories`, (C, S, ..., K, size).
+        paths: `lfm_ppl.inference.trajectories.trajectories`, (C, S, ..., K, size).
 
     Returns:
         Variables ``states_summary``, ``forces_summary``, ``deterministics_summary``, ``outputs_summary``

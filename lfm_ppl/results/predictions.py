@@ -51,7 +51,7 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], draw_index: 
 
     Args:
         bound: the model and its data.
-        paths: what `lfm_ppl.inference.posterior.trajectories` drew, each (C, S, ..., K, size).
+        paths: what `lfm_ppl.inference.trajectories.trajectories` drew, each (C, S, ..., K, size).
         draw_index: (S,), draws of each chain.
         times: (K,), or (B, K) for each series of a panel.
         labels: dimension -> names, of "output" where they are not the model's, and of the series of a panel.

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from lfm_ppl.accuracy.log_likelihoods import LikelihoodProblem
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.likelihood_site import LikelihoodSite
 from lfm_ppl.io.data_set import (
     OF_SERIES,
     InputTable,
@@ -24,9 +24,9 @@ from lfm_ppl.io.data_set import (
     keywords_by_site,
     model_keywords,
 )
+from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.results import arviz_data, inputs
-from lfm_ppl.results.likelihoods import LikelihoodProblem
 from lfm_ppl.results.series import TIMES, is_selected_series, series_labels, times_of
 from lfm_ppl.results.sites import is_selected_site, select_site
 from lfm_ppl.utils import calendar_time

@@ -12,7 +12,7 @@ import numpy as np
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.posterior import has_noise_of_rows
+from lfm_ppl.inference.trajectories import has_noise_of_rows
 from lfm_ppl.io.data import as_data
 from lfm_ppl.io.data_set import Data, at_origin, in_unit, keywords_by_site, model_keywords
 from lfm_ppl.io.table import is_table

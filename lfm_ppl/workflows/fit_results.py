@@ -24,20 +24,20 @@ from typing import Any
 import jax
 import numpy as np
 
+from lfm_ppl.accuracy.approximation import approximation_warnings, resolution_warnings
+from lfm_ppl.accuracy.prior_conflict import prior_conflicts
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.posterior import evenly_spaced, scores, trajectories
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS
 from lfm_ppl.inference.site_failures import failures_at, path_ess, site_failures
+from lfm_ppl.inference.trajectories import evenly_spaced, scores, trajectories
 from lfm_ppl.io.data_set import Data
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.approximation import approximation_warnings, resolution_warnings
 from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, TrajectoryDraws, force_periods, lay_out
 from lfm_ppl.results.predictions import SHOWN_PERIODS, repeats_often
-from lfm_ppl.results.prior_conflict import prior_conflicts
 from lfm_ppl.results.sites import merge_sites
 from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
@@ -234,7 +234,7 @@ def draw_paths(key: jax.Array, bound: BoundModel, values: Mapping[str, np.ndarra
         count: number of trajectories.
         particle_settings: of the particle smoother; None: the Gaussian smoother.
         particle_steps: integration steps of the particles.
-        **batch_options: ``report`` and ``store`` of `lfm_ppl.inference.posterior.trajectories`.
+        **batch_options: ``report`` and ``store`` of `lfm_ppl.inference.trajectories.trajectories`.
 
     Returns:
         The trajectories (C, S, ...), with the draws of each chain and the times.

@@ -10,13 +10,13 @@ import jax
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.inference.posterior import evenly_spaced, has_noise_of_rows, trajectories
+from lfm_ppl.accuracy.log_likelihoods import LikelihoodProblem
+from lfm_ppl.inference.trajectories import evenly_spaced, has_noise_of_rows, trajectories
 from lfm_ppl.io.data_set import OF_SERIES, Data, on_clock_of_fit
 from lfm_ppl.model.events import Event
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results import inputs as known_inputs
-from lfm_ppl.results.likelihoods import LikelihoodProblem
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
 from lfm_ppl.results.series import is_selected_series, of_all_series, panel_of, select_series, series_dimension
 from lfm_ppl.results.sites import all_sites_of, is_selected_site, select_site

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.posterior import scores
+from lfm_ppl.inference.trajectories import scores
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.layout import Labels, TrajectoryDraws, checked_truth
 from lfm_ppl.utils import checks

@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from lfm_ppl.accuracy.report import AccuracyReport
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.report import AccuracyReport
 
 
 def test_check_prints_stores_and_draws(run, fitted):

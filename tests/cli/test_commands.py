@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from lfm_ppl import cli
-from lfm_ppl.cli import choices, main, results
+from lfm_ppl.cli import choices, folders, main
 from lfm_ppl.experiments import catalogue
 from lfm_ppl.io import loading
 from lfm_ppl.results import arviz_data
@@ -150,10 +150,10 @@ def test_results_are_never_overwritten(run, well, tmp_path):
 def test_folders_are_numbered_and_not_left_empty(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     for number in (1, 2):
-        with results.folder("spring", None, overwrite=False) as folder:
+        with folders.folder("spring", None, overwrite=False) as folder:
             assert folder == Path(f"lfm-results/spring-00{number}")
             (folder / "posterior.nc").write_text("")
-    with pytest.raises(RuntimeError), results.folder("spring", None, overwrite=False) as folder:
+    with pytest.raises(RuntimeError), folders.folder("spring", None, overwrite=False) as folder:
         raise RuntimeError
     assert not folder.exists()
 

@@ -13,7 +13,7 @@ from references import LinearLFM, matern
 from systems import Linear, whole_state
 
 import lfm_ppl as lfm
-from lfm_ppl.results import calibration
+from lfm_ppl.accuracy import calibration
 
 TIMES = np.linspace(0.0, 4.0, 6)
 COUPLING = np.array([[0.5], [0.25]])

@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 from systems import Linear, whole_state
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.handlers.settings import approximate
+from lfm_ppl.likelihoods.handlers.settings import approximate
 
 NOISE = 0.08**2
 

@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 from scipy import integrate, stats
 
+from lfm_ppl.experiments import importance_at_modes
 from lfm_ppl.experiments.call_centre import counts, experiment, learning, problem, tracking
-from lfm_ppl.results import importance_at_modes
 
 DATA = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="the counts of real calls are not there (LFM_DATA)")

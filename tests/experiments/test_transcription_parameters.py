@@ -6,7 +6,7 @@ import numpyro
 import pytest
 
 from lfm_ppl.experiments.transcription import parameters, problem
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.parallel.task import Task
 
 SOFTPLUS = parameters.LINKS["softplus"]

@@ -10,7 +10,7 @@ import pytest
 from numpyro.infer import NUTS
 
 import lfm_ppl as lfm
-from lfm_ppl.results import calibration
+from lfm_ppl.accuracy import calibration
 
 TIMES = np.linspace(0.0, 6.0, 10)
 

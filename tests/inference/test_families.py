@@ -16,10 +16,10 @@ from numpyro.infer import NUTS, Predictive
 from numpyro.infer.util import log_density
 
 import lfm_ppl as lfm
+from lfm_ppl.accuracy import calibration
 from lfm_ppl.inference.bind import bind
-from lfm_ppl.inference.handlers import settings
 from lfm_ppl.io import loading
-from lfm_ppl.results import calibration
+from lfm_ppl.likelihoods.handlers import settings
 
 TIMES = 0.5 * np.arange(16)
 LENGTHSCALE = 1.5

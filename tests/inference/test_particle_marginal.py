@@ -9,12 +9,12 @@ import pytest
 from numpyro.infer import MCMC
 
 import lfm_ppl as lfm
-from lfm_ppl.inference import particle_likelihood
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalState, particle_marginal
 from lfm_ppl.inference.kernels.robust_metropolis import Adaptation, initial_state
-from lfm_ppl.inference.particle_likelihood import ParticlePotential
-from lfm_ppl.inference.posterior import trajectories
+from lfm_ppl.inference.particle_potential import ParticlePotential
+from lfm_ppl.inference.trajectories import trajectories
+from lfm_ppl.likelihoods import particle_likelihood
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results.arviz_data import group, summary
 

@@ -11,9 +11,9 @@ from rules import RULES
 
 import lfm_ppl as lfm
 from lfm_ppl.cli import options
+from lfm_ppl.linearisation.input_selection import InputStructure
 from lfm_ppl.linearisation.rule import Inputs
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
-from lfm_ppl.linearisation.structure import InputStructure
 
 SIGMA = [rule for rule in RULES if isinstance(rule, SigmaPointRule)]
 MEAN = np.array([0.3, -0.5, 0.8, 0.1])

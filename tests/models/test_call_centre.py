@@ -10,8 +10,8 @@ import pytest
 from scipy import integrate
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.io import loading
+from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 
 
 def own():

@@ -12,10 +12,10 @@ from numpyro.infer import Predictive
 from numpyro.infer.util import log_density
 
 from lfm_ppl.filtering.arguments import check_observations
-from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.io import loading
 from lfm_ppl.io.data import read_csv, write_csv
 from lfm_ppl.io.data_set import Data
+from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 
 MODELS = sorted(loading.available())
 CHEAP = ("spring", "ginzburg-landau", "ballistic")

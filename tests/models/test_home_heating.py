@@ -6,8 +6,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.io import loading
+from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 
 FILE = loading.load("home-heating")
 TIMES = np.arange(0.0, 13.0)

@@ -13,9 +13,9 @@ from numpyro.handlers import condition, trace
 
 import lfm_ppl as lfm
 from lfm_ppl.inference.bind import bind
-from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.optimise import newton, quasi_newton
 from lfm_ppl.io import loading
+from lfm_ppl.likelihoods.handlers.settings import approximate
 from lfm_ppl.results.arviz_data import group, summary
 
 ROOT = Path(__file__).resolve().parent.parent.parent

@@ -11,13 +11,14 @@ import xarray as xr
 from scipy import stats
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.handlers.settings import approximate
-from lfm_ppl.results import accuracy, arviz_data, importance, likelihoods, rebuilding
-from lfm_ppl.results.accuracy import check_accuracy
-from lfm_ppl.results.correction import correct_posterior
+from lfm_ppl.accuracy import importance_weights, log_likelihoods
+from lfm_ppl.accuracy.check_accuracy import check_accuracy
+from lfm_ppl.accuracy.correction import correct_posterior
+from lfm_ppl.accuracy.report import AccuracyReport
+from lfm_ppl.accuracy.verdict import Findings, judge
+from lfm_ppl.likelihoods.handlers.settings import approximate
+from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.plots import plot_accuracy
-from lfm_ppl.results.report import AccuracyReport
-from lfm_ppl.results.verdict import Findings, judge
 
 TIMES = np.arange(6.0)
 Y = np.array([[0.9], [1.1], [np.nan], [0.8], [1.2], [0.7]])
@@ -44,13 +45,13 @@ def test_average_is_the_log_of_the_mean_with_the_variance_of_the_jackknife():
     sd, replicates = 0.4, 4
     generator = np.random.default_rng(0)
     noise = generator.normal(-0.5 * sd**2, sd, (20_000, replicates))  # mean one on the scale of the likelihood
-    result = importance.average(3.0 + noise)
+    result = importance_weights.average(3.0 + noise)
     assert abs(np.exp(result.log_mean - 3.0).mean() - 1.0) < 4 * np.sqrt(np.expm1(sd**2) / noise.size)
     # The spread over 20,000 draws is known to 0.5%; the jackknife's bias is of second order in the variance, 0.16 / 4.
     np.testing.assert_allclose(np.sqrt(result.variance.mean()), result.log_mean.std(), rtol=0.04)
-    np.testing.assert_allclose(importance.average(np.array([[1.0, 1.0]])).log_mean, [1.0])
-    assert importance.average(np.full((1, 3), -np.inf)).log_mean[0] == -np.inf
-    assert np.isnan(importance.average(np.zeros((2, 1))).variance).all()
+    np.testing.assert_allclose(importance_weights.average(np.array([[1.0, 1.0]])).log_mean, [1.0])
+    assert importance_weights.average(np.full((1, 3), -np.inf)).log_mean[0] == -np.inf
+    assert np.isnan(importance_weights.average(np.zeros((2, 1))).variance).all()
 
 
 @pytest.mark.parametrize("coefficient", [0.0, 0.6], ids=["independent", "autocorrelated"])
@@ -63,8 +64,8 @@ def test_corrected_moments_are_right_within_calibrated_errors(coefficient, noise
     for _ in range(300):
         x = autoregressive(generator, 4, 400, coefficient)
         ratio = log_ratio(x[:, chosen]) + generator.normal(-0.5 * noise**2, noise, (4, len(chosen)))
-        weights = importance.smooth(ratio)
-        row = importance.corrected_moments({"x": x}, chosen, weights.log_weight).loc["x"]
+        weights = importance_weights.smooth(ratio)
+        row = importance_weights.corrected_moments({"x": x}, chosen, weights.log_weight).loc["x"]
         sd = row["sd"]
         scores.append([(row["corrected_mean"] - TARGET_MEAN) / row["corrected_mean_se"],
                        (row["sd_ratio"] - TARGET_SD / WRONG_SD) / row["sd_ratio_se"],
@@ -78,10 +79,10 @@ def test_corrected_moments_are_right_within_calibrated_errors(coefficient, noise
 def test_without_a_difference_nothing_changes():
     x = np.random.default_rng(0).normal(size=(4, 100))
     chosen = np.arange(0, 100, 10)
-    weights = importance.smooth(np.full((4, 10), 2.5))
+    weights = importance_weights.smooth(np.full((4, 10), 2.5))
     assert weights.k == -np.inf and weights.reliable
     np.testing.assert_allclose(weights.ess, 40.0)
-    row = importance.corrected_moments({"x": x, "fixed": np.ones((4, 100))}, chosen, weights.log_weight)
+    row = importance_weights.corrected_moments({"x": x, "fixed": np.ones((4, 100))}, chosen, weights.log_weight)
     assert abs(row.loc["x", "shift"]) < 1e-12 and abs(row.loc["x", "sd_ratio"] - 1.0) < 1e-12
     assert row.loc["fixed"].tolist() == [1, 0, 1, 0, 0, 0, 1, 0, 0]
 
@@ -90,30 +91,30 @@ def test_k_tells_heavy_tails():
     """Ratios that are Pareto variables of shape k have tails of shape k."""
     uniform = np.random.default_rng(3).uniform(size=(1, 4000))
     for k in (0.2, 0.5, 0.9):
-        result = importance.smooth(-k * np.log(uniform))
+        result = importance_weights.smooth(-k * np.log(uniform))
         assert abs(result.k - k) < 0.2  # 190 tail draws: sd (1 + k) / sqrt(190), at most 0.14
         assert result.reliable == (result.k < 0.7)
-    assert importance.smooth(np.arange(4.0)[None]).k == np.inf  # too few draws
+    assert importance_weights.smooth(np.arange(4.0)[None]).k == np.inf  # too few draws
     with pytest.raises(ValueError, match="zero"):
-        importance.smooth(np.full((2, 10), -np.inf))
+        importance_weights.smooth(np.full((2, 10), -np.inf))
     with pytest.raises(ValueError, match="NaN"):
-        importance.smooth(np.array([[0.0, np.nan]]))
+        importance_weights.smooth(np.array([[0.0, np.nan]]))
 
 
 def test_an_impossible_draw_has_no_weight():
     ratio = np.random.default_rng(0).normal(size=(1, 200))
     ratio[0, :3] = -np.inf
-    assert np.all(importance.smooth(ratio).log_weight[0, :3] == -np.inf)
+    assert np.all(importance_weights.smooth(ratio).log_weight[0, :3] == -np.inf)
 
 
 def test_resampling_copies_in_proportion():
     weight = np.array([[0.5, 0.125], [0.25, 0.125]])
-    count = np.bincount(importance.resample(np.log(weight), 800, seed=1), minlength=4)
+    count = np.bincount(importance_weights.resample(np.log(weight), 800, seed=1), minlength=4)
     np.testing.assert_array_equal(count, [400, 100, 200, 100])
 
 
 def findings(**changes):
-    table = importance.corrected_moments({"rate": np.random.default_rng(0).normal(size=(4, 50))}, np.arange(50),
+    table = importance_weights.corrected_moments({"rate": np.random.default_rng(0).normal(size=(4, 50))}, np.arange(50),
                                          np.full((4, 50), -np.log(200)))
     rows = {name: changes.pop(name) for name in list(changes) if name in table.columns}
     table = table.assign(**rows)
@@ -204,7 +205,7 @@ def test_a_linear_model_needs_no_reference(linear):
 @pytest.mark.slow
 def test_ratios_of_a_linear_model_are_zero_on_the_grid(linear):
     report = check_accuracy(linear, relaxation, reference="grid", draws=40, progress=False)
-    assert np.abs(report.log_ratio).max() < 2 * likelihoods.GRID_ERROR
+    assert np.abs(report.log_ratio).max() < 2 * log_likelihoods.GRID_ERROR
     assert report.verdict.word == "trust" and "grid" in report.reference
     assert report.table["shift"].abs().max() < 0.01
     assert set(report.table.index) == {"rate", "half_life"}
@@ -230,7 +231,8 @@ def test_particles_and_grid_agree(bent):
     difference = noisy.log_ratio - exact.log_ratio
     assert 0.02 < noisy.noise_sd < 0.1
     # The log of a mean is low by half its variance; 400 draws.
-    assert abs(difference.mean()) < likelihoods.GRID_ERROR + 0.5 * noisy.noise_sd**2 + 4 * noisy.noise_sd / np.sqrt(400)
+    bound = log_likelihoods.GRID_ERROR + 0.5 * noisy.noise_sd**2 + 4 * noisy.noise_sd / np.sqrt(400)
+    assert abs(difference.mean()) < bound
     assert abs(difference.std() / noisy.noise_sd - 1.0) < 0.2  # 4 sd / sqrt(800), and the grid's error
     both = noisy.table.loc["depth"], exact.table.loc["depth"]
     assert abs(both[0]["shift"] - both[1]["shift"]) < 4 * both[0]["shift_se"]
@@ -246,8 +248,8 @@ def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     posteriors = {}
     at_nodes = replace(problem, draws={"depth": nodes})
     prior = np.asarray(dist.LogNormal(0.0, 0.4).log_prob(nodes))
-    exact = likelihoods.on_grid(at_nodes, likelihoods.ReferenceSettings("grid", None, 1)).estimates[:, 0]
-    wrong = likelihoods.gaussian(at_nodes)
+    exact = log_likelihoods.on_grid(at_nodes, log_likelihoods.ReferenceSettings("grid", None, 1)).estimates[:, 0]
+    wrong = log_likelihoods.gaussian(at_nodes)
     for name, log in (("exact", exact), ("wrong", wrong)):
         density = np.exp(log + prior - (log + prior).max())
         density /= density.sum()
@@ -338,7 +340,7 @@ def test_a_panel_is_the_sum_of_its_series():
     run = lambda model, y, **keywords: check_accuracy(  # noqa: E731
         result, model, TIMES, y, draws=8, progress=False, **keywords)
     alone, together = run(single, Y), run(panel, np.stack([Y, Y]))
-    np.testing.assert_allclose(together.log_ratio, 2 * alone.log_ratio, atol=4 * likelihoods.GRID_ERROR)
+    np.testing.assert_allclose(together.log_ratio, 2 * alone.log_ratio, atol=4 * log_likelihoods.GRID_ERROR)
     particles = run(panel, np.stack([Y, Y]), reference="particles", particles=1000)
     assert np.abs(particles.log_ratio - together.log_ratio).max() < 5 * particles.noise_sd + 0.02
 
@@ -346,34 +348,34 @@ def test_a_panel_is_the_sum_of_its_series():
 def test_enough_particles_are_found(bent):
     """The pilot raises the number until the noise is below its target."""
     problem = rebuilding.problem(bent, well).select(np.arange(0, 400, 25))
-    settings = likelihoods.ReferenceSettings("particles", None, 2)
-    noise = lambda e: accuracy.noise(importance.average(e))  # noqa: E731
-    result = likelihoods.by_particles(problem, settings, noise, 0.02, 1e12)
+    settings = log_likelihoods.ReferenceSettings("particles", None, 2)
+    noise = lambda e: check_accuracy.noise(importance_weights.average(e))  # noqa: E731
+    result = log_likelihoods.by_particles(problem, settings, noise, 0.02, 1e12)
     assert result.particles > 1000 and not result.limited
     assert noise(result.estimates) < 0.03
-    limited = likelihoods.by_particles(problem, settings, noise, 0.001, 1e6)
+    limited = log_likelihoods.by_particles(problem, settings, noise, 0.001, 1e6)
     assert limited.particles == 1000 and limited.limited
 
 
 def test_more_particles_are_run_only_until_the_verdict_is_settled(bent, monkeypatch):
     problem = rebuilding.problem(bent, well).select(np.arange(0, 400, 50))
-    settings = likelihoods.ReferenceSettings("particles", None, 2)
-    monkeypatch.setattr(likelihoods, "_FIRST_WORK", 1.0)
+    settings = log_likelihoods.ReferenceSettings("particles", None, 2)
+    monkeypatch.setattr(log_likelihoods, "_FIRST_WORK", 1.0)
     shapes, answers = [], iter([False, True])
 
     def is_settled(estimates):
         shapes.append(estimates.shape)
         return next(answers)
 
-    result = likelihoods.by_particles(problem, settings, lambda estimates: 3.0, 0.3, 1e12, is_settled)
+    result = log_likelihoods.by_particles(problem, settings, lambda estimates: 3.0, 0.3, 1e12, is_settled)
     assert result.particles == 4000 and not result.limited and shapes == [(8, 1, 2)] * 2
 
 
 def test_replicates_of_each_series_are_averaged_apart():
     likelihood = np.array([[[1.0, 3.0], [2.0, 6.0]]])  # one draw, two series, two replicates
-    averaged = accuracy._summed(np.log(likelihood))
+    averaged = check_accuracy._summed(np.log(likelihood))
     np.testing.assert_allclose(averaged.log_mean, np.log(2.0 * 4.0))
-    parts = importance.average(np.log(likelihood[0]))
+    parts = importance_weights.average(np.log(likelihood[0]))
     np.testing.assert_allclose(averaged.variance, parts.variance.sum())
 
 
@@ -432,8 +434,8 @@ def test_the_grid_is_not_for_models_with_events():
     model = lfm.LatentForceModel(
         lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1), events=[lfm.Dose([1.0], 1.0, "x0")])
-    assert accuracy._kind("auto", lfm.state_space(model)) == "particles"
+    assert check_accuracy._kind("auto", lfm.state_space(model)) == "particles"
     with pytest.raises(ValueError, match="events"):
-        accuracy._kind("grid", lfm.state_space(model))
+        check_accuracy._kind("grid", lfm.state_space(model))
     with pytest.raises(ValueError, match="events"):
         lfm.fokker_planck(model, np.arange(3.0), np.ones((3, 1)))

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 import lfm_ppl as lfm
-from lfm_ppl.results import calibration
+from lfm_ppl.accuracy import calibration
 from lfm_ppl.results.plots import plot_calibration
 
 DRAWS = 63

@@ -9,8 +9,8 @@ import lfm_ppl as lfm
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid.finite_volume import Grid
 from lfm_ppl.fokker_planck_grid.grid_filter import log_likelihood
-from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.io import loading
+from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 from lfm_ppl.model.state_space import state_space
 from lfm_ppl.results.arviz_data import group, summary
 

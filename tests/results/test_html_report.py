@@ -11,9 +11,9 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
-from lfm_ppl.cli import page as cli_page
+from lfm_ppl.accuracy.importance_weights import COLUMNS
+from lfm_ppl.cli import pages as cli_page
 from lfm_ppl.results import arviz_data, html_report
-from lfm_ppl.results.importance import COLUMNS
 
 VOID = {"meta", "img", "wbr"}
 EVIL = "<script>alert('&\"')</script>"

@@ -8,7 +8,7 @@ import numpyro
 import numpyro.distributions as dist
 
 import lfm_ppl as lfm
-from lfm_ppl.results.prior_conflict import prior_conflicts
+from lfm_ppl.accuracy.prior_conflict import prior_conflicts
 
 
 def model(times, y=None):

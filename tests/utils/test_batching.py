@@ -10,7 +10,7 @@ import numpyro.distributions as dist
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.posterior import scores, trajectories
+from lfm_ppl.inference.trajectories import scores, trajectories
 from lfm_ppl.utils import batching, compilation
 
 

@@ -22,8 +22,8 @@ import xarray as xr
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.inference import sampling
-from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.samplers import SAMPLERS
+from lfm_ppl.likelihoods.handlers.settings import approximate
 from lfm_ppl.results import arviz_data, run_record
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
@@ -247,7 +247,7 @@ def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
 
 def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
     result = whole("map")
-    monkeypatch.setattr("lfm_ppl.inference.map_draws._SEQUENTIAL_BATCH", 2)
+    monkeypatch.setattr("lfm_ppl.inference.draw_batches._SEQUENTIAL_BATCH", 2)
     check = lambda **more: lfm.check_accuracy(  # noqa: E731
         result, relaxation, reference="particles", particles=20, draws=6, progress=False, **more).dataset
     expected = check()

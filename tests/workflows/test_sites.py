@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.posterior import trajectories
+from lfm_ppl.inference.trajectories import trajectories
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.plots import save_figures
 from lfm_ppl.workflows.data_binding import data_by_site

@@ -24,13 +24,13 @@ from lfm_ppl.experiments import chains
 from lfm_ppl.experiments.ballistic import problem
 from lfm_ppl.experiments.ballistic.problem import SimulatedTarget, posterior
 from lfm_ppl.experiments.ballistic.states import smoothed_paths
+from lfm_ppl.experiments.importance_at_modes import Weighted, weighted_posterior
 from lfm_ppl.experiments.scores import GridPosterior, interval, score_path, total_moments
 from lfm_ppl.experiments.tasks import dataset_indices, stack_results
 from lfm_ppl.experiments.timing import time_compiled_call
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.optimise import Minimum, newton, quasi_newton
 from lfm_ppl.parallel.task import Result, Task
-from lfm_ppl.results.importance_at_modes import Weighted, weighted_posterior
 
 SAMPLERS = ("NUTS", "RAM")
 LEVELS = (0.5, 0.8, 0.95)

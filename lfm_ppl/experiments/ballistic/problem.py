@@ -22,11 +22,11 @@ import numpy as np
 from numpyro import handlers
 
 from lfm_ppl.inference.bind import bind
-from lfm_ppl.inference.handlers.fixing import fix
 from lfm_ppl.inference.log_posterior import LogPosterior
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.io import loading
 from lfm_ppl.io.data import Data
+from lfm_ppl.likelihoods.handlers.fixing import fix
+from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.simulate import simulate
 
 NAMES = ("alpha", "scale", "lengthscale")

@@ -1,7 +1,7 @@
 """Parameters of a model of the arrivals, given three days: the most likely ones, and their posterior.
 
 The posterior of the logarithms z under the model's priors is represented by importance samples about all modes that
-searches find, see `lfm_ppl.results.importance_at_modes`.
+searches find, see `lfm_ppl.experiments.importance_at_modes`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import numpy as np
 
 from lfm_ppl.experiments.call_centre import problem
 from lfm_ppl.experiments.call_centre.problem import ArrivalModel
+from lfm_ppl.experiments.importance_at_modes import Weighted, weighted_posterior
 from lfm_ppl.inference.optimise import End, Minimum, quasi_newton
-from lfm_ppl.results.importance_at_modes import Weighted, weighted_posterior
 
 LIMITS = {"mean": (1.0, 30.0), "scale": (0.1, 30.0), "lengthscale": (10.0, 10_000.0), "memory": (0.2, 10_000.0),
           "noise_sd": (0.01, 5.0)}

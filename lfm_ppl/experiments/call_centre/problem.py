@@ -14,9 +14,9 @@ import numpy as np
 from lfm_ppl.experiments.call_centre import counts
 from lfm_ppl.experiments.call_centre.counts import BIN, COUNTS_PER_DAY, DAY, CallCounts
 from lfm_ppl.inference.bind import bind
-from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.io import loading
+from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 from lfm_ppl.model.inputs import Input
 
 UTILISATION = 0.7

@@ -31,6 +31,7 @@ from lfm_ppl.constrained.full_information import ConstrainedEstimate, full_infor
 from lfm_ppl.constrained.posterior import ConstrainedPosterior, constrained_posterior
 from lfm_ppl.experiments.constrained import problem
 from lfm_ppl.experiments.constrained.problem import FACTOR, HORMONE, TIMES, WINDOW
+from lfm_ppl.experiments.importance_at_modes import weighted_posterior
 from lfm_ppl.experiments.scores import Z, interval_coverage, rmse
 from lfm_ppl.experiments.tasks import dataset_indices
 from lfm_ppl.filtering.smoother import smooth
@@ -38,7 +39,6 @@ from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import newton, quasi_newton
 from lfm_ppl.linearisation.sigma_points import GaussHermite
 from lfm_ppl.parallel.task import Result, Task
-from lfm_ppl.results.importance_at_modes import weighted_posterior
 
 MAX_PEAK_ERROR = 1.0
 """Largest error (h) of a correct peak time."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import xarray as xr
 
+from lfm_ppl.accuracy.importance_weights import LARGEST_K
 from lfm_ppl.experiments import study
 from lfm_ppl.experiments.constrained import estimators, figures, problem
 from lfm_ppl.experiments.constrained.estimators import BANDS, FULL, METHODS, SMOOTHER
@@ -16,7 +17,6 @@ from lfm_ppl.experiments.scores import SE, estimate_rate
 from lfm_ppl.experiments.study import Data, Study, StudyTable, setting
 from lfm_ppl.experiments.tasks import dataset_blocks, slug
 from lfm_ppl.parallel.task import Result, Task
-from lfm_ppl.results.importance import LARGEST_K
 
 
 @dataclass(frozen=True)

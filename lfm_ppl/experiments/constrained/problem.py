@@ -24,10 +24,10 @@ from scipy.signal import lfilter
 
 from lfm_ppl.forces import Matern
 from lfm_ppl.inference.bind import bind
-from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.inference.log_posterior import LogPosterior
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.io import loading
+from lfm_ppl.likelihoods.likelihood_site import likelihood_site
+from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.linearisation.sigma_points import Cubature, GaussHermite
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.latent_force_model import LatentForceModel

@@ -27,10 +27,10 @@ from lfm_ppl.experiments.tasks import dataset_indices
 from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import grid_filter
-from lfm_ppl.inference.handlers.settings import approximate
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM
 from lfm_ppl.inference.kernels.ram import RAM
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.likelihoods.handlers.settings import approximate
+from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.state_space import state_space
 from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.particles import particle_filter

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.inference.likelihood_site import likelihood_site
 from lfm_ppl.io import loading
+from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature, GaussHermite
 from lfm_ppl.linearisation.taylor import Taylor

@@ -21,11 +21,11 @@ import numpy as np
 import pandas as pd
 from numpyro import handlers
 
-from lfm_ppl.inference.handlers.fixing import fix
-from lfm_ppl.inference.likelihood_site import likelihood_site
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
+from lfm_ppl.likelihoods.handlers.fixing import fix
+from lfm_ppl.likelihoods.likelihood_site import likelihood_site
+from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation

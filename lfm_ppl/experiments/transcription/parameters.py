@@ -20,15 +20,15 @@ import numpyro
 import numpyro.distributions as dist
 from numpyro.infer import NUTS, init_to_uniform
 
+from lfm_ppl.accuracy import importance_weights
 from lfm_ppl.experiments import chains, scores
 from lfm_ppl.experiments.timing import time_call
 from lfm_ppl.experiments.transcription import problem
-from lfm_ppl.inference.handlers.on_latent_grid import on_latent_grid
 from lfm_ppl.inference.kernels.ram import RAM
-from lfm_ppl.inference.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.likelihoods.handlers.on_latent_grid import on_latent_grid
+from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.linearisation.sigma_points import GaussHermite
 from lfm_ppl.parallel.task import Result, Task
-from lfm_ppl.results import importance
 from lfm_ppl.utils.programs import forget_executables
 
 RULE, STEPS = GaussHermite(7), 6
@@ -147,12 +147,12 @@ def _resample_draws(settings: Mapping[str, Any], iterations: int, data: problem.
 
     flat = jnp.asarray(draws.reshape(len(draws), -1).T)
     ratios = jax.jit(lambda points: jax.lax.map(log_ratio, points, batch_size=min(BATCH, len(points))))(flat)
-    smoothed = importance.smooth(np.asarray(ratios).reshape(draws.shape[1:]))
+    smoothed = importance_weights.smooth(np.asarray(ratios).reshape(draws.shape[1:]))
     if not np.isfinite(smoothed.log_weight).any(axis=1).all():
         raise ValueError("the iterated likelihood is zero at all draws of a chain, which cannot be weighted; use more "
                          "draws or no iterations.")
     # Another order than that of the chain would overstate the effective sample size.
-    indices = [np.sort(importance.resample(weights, len(weights), chain))
+    indices = [np.sort(importance_weights.resample(weights, len(weights), chain))
                for chain, weights in enumerate(smoothed.log_weight)]
     return np.stack([draws[:, chain, index] for chain, index in enumerate(indices)], axis=1), smoothed.k
 

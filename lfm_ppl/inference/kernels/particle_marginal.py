@@ -40,7 +40,7 @@ from lfm_ppl.inference.kernels.robust_metropolis import (
     propose,
     summary,
 )
-from lfm_ppl.inference.particle_likelihood import ParticlePotential, Tuned
+from lfm_ppl.inference.particle_potential import ParticlePotential, Tuned
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.random_keys import split_by_name

@@ -16,10 +16,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lfm_ppl.accuracy.report import AccuracyReport
 from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.plots.chains import known_truth, parameter_units
-from lfm_ppl.results.report import AccuracyReport
 from lfm_ppl.results.scalars import choose, scalar_draws
 
 MAX_PANELS = 11

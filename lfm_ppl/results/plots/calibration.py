@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
 from scipy import stats
 
-from lfm_ppl.results.calibration import Calibration, p_values
+from lfm_ppl.accuracy.calibration import Calibration, p_values
 from lfm_ppl.results.plots import style
 
 MAX_PANELS = 9
@@ -27,7 +27,7 @@ def plot_calibration(calibration: Calibration, parameters: Sequence[str] | None 
     largest distance between the distribution function of the ranks and the uniform one.
 
     Args:
-        calibration: what `lfm_ppl.results.calibration.calibrate` returns.
+        calibration: what `lfm_ppl.accuracy.calibration.calibrate` returns.
         parameters: names; None for all, up to 9.
         bins: a divisor of the number of possible ranks.
         width: "column" (3.4 in), "full" (7 in), or inches.

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.priors import central_interval
+from lfm_ppl.likelihoods.priors import central_interval
 
 
 def prior_conflicts(bound: BoundModel, draws: Mapping[str, np.ndarray]) -> list[str]:

@@ -32,8 +32,8 @@ from lfm_ppl.filtering.stiffness import (
     long_step_message,
     warn_of_message,
 )
-from lfm_ppl.inference.marginal_likelihood import SIMULATION_STEPS
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood, repeat_draw
+from lfm_ppl.likelihoods.marginal_likelihood import SIMULATION_STEPS
+from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import replicate

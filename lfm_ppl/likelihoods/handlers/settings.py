@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from lfm_ppl.inference.constrained_likelihood import likelihood_with
-from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.likelihood import Likelihood
-from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.switching import Switching
+from lfm_ppl.likelihoods.constrained_likelihood import ConstrainedLikelihood, likelihood_with
+from lfm_ppl.likelihoods.handlers.likelihood_handler import LikelihoodHandler
+from lfm_ppl.likelihoods.likelihood import Likelihood
+from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
+from lfm_ppl.likelihoods.panel import Panel
 
 NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "method", "sites", "lower", "upper",
          "constraints", "grid", "draws")
@@ -63,7 +63,7 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
 
     def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> Any:
         """Return the likelihood with the new settings."""
-        if isinstance(likelihood, Switching):
+        if not isinstance(likelihood, (Panel, MarginalLikelihood, ConstrainedLikelihood)):
             return likelihood.with_settings(**self.settings)
         has_equal_steps = "steps" in self.settings or self.settings.get("iterations", 0) > 0
         is_single_pass = any(self.settings.get(name) for name in ("tolerance", "lower", "upper", "constraints"))

@@ -24,8 +24,8 @@ from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.map_draws import BatchStore, map_draws
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.inference.draw_batches import BatchStore, map_draws
+from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel

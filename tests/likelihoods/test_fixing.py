@@ -9,8 +9,8 @@ import pytest
 from numpyro.infer import Predictive
 from numpyro.infer.util import potential_energy
 
-from lfm_ppl.inference.handlers.fixing import fix, pin
-from lfm_ppl.inference.priors import prior
+from lfm_ppl.likelihoods.handlers.fixing import fix, pin
+from lfm_ppl.likelihoods.priors import prior
 
 COVARIANCE = np.array([[1.0, 0.8, 0.3], [0.8, 1.0, 0.5], [0.3, 0.5, 1.0]])
 LABELS = ("a", "b", "c")

@@ -21,9 +21,9 @@ from lfm_ppl.filtering.arguments import as_rule
 from lfm_ppl.filtering.ep.settings import SiteSettings
 from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD
 from lfm_ppl.filtering.stiffness import long_step_message, warn_of_message
-from lfm_ppl.inference.constrained_likelihood import likelihood_with
-from lfm_ppl.inference.likelihood import Likelihood
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood, refuse_times_by_site, repeat_draw
+from lfm_ppl.likelihoods.constrained_likelihood import likelihood_with
+from lfm_ppl.likelihoods.likelihood import Likelihood
+from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood, refuse_times_by_site, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.events import check_start, event_table
 from lfm_ppl.model.latent_force_model import LatentForceModel

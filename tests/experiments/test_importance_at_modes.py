@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from lfm_ppl.results.importance_at_modes import moments, weighted
+from lfm_ppl.experiments.importance_at_modes import moments, weighted
 
 
 def test_weighted_draws_have_the_moments_of_their_density():

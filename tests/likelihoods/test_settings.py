@@ -8,7 +8,7 @@ import pytest
 from numpyro.infer.util import log_density
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.handlers.settings import approximate
+from lfm_ppl.likelihoods.handlers.settings import approximate
 
 TIMES = jnp.arange(4.0)
 Y = jnp.array([[0.3], [-0.2], [0.9], [0.1]])

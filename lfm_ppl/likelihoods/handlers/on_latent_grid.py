@@ -13,11 +13,11 @@ import numpyro.distributions as dist
 from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
-from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.likelihood import Likelihood
-from lfm_ppl.inference.panel import Panel
-from lfm_ppl.inference.series_likelihood import repeat_draw
 from lfm_ppl.latent_grid.latent_grid import RULES, LatentGrid
+from lfm_ppl.likelihoods.handlers.likelihood_handler import LikelihoodHandler
+from lfm_ppl.likelihoods.likelihood import Likelihood
+from lfm_ppl.likelihoods.panel import Panel
+from lfm_ppl.likelihoods.series_likelihood import repeat_draw
 from lfm_ppl.utils import checks
 
 

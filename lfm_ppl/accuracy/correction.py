@@ -10,10 +10,11 @@ import jax
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.inference.posterior import evenly_spaced, trajectories
-from lfm_ppl.results import arviz_data, importance, rebuilding
+from lfm_ppl.accuracy import importance_weights
+from lfm_ppl.accuracy.report import AccuracyReport
+from lfm_ppl.inference.trajectories import evenly_spaced, trajectories
+from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.layout import with_summaries
-from lfm_ppl.results.report import AccuracyReport
 from lfm_ppl.results.series import TIMES, times_of
 from lfm_ppl.utils import checks
 
@@ -61,7 +62,7 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
     chains, size = report.log_weight.shape
     draw_index = np.searchsorted(posterior["draw"].values, report.dataset["draw"].values)
     of_all = (np.arange(chains)[:, None] * posterior.sizes["draw"] + draw_index).ravel()
-    picked = of_all[importance.resample(report.log_weight, chains * size, seed)].reshape(chains, size)
+    picked = of_all[importance_weights.resample(report.log_weight, chains * size, seed)].reshape(chains, size)
     groups = {name: _select_draws(arviz_data.group(result, name), picked) for name in _OF_DRAWS
               if arviz_data.has_group(result, name)}
     groups |= {name: arviz_data.group(result, name) for name in _KEPT if arviz_data.has_group(result, name)}

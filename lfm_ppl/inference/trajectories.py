@@ -21,10 +21,10 @@ from lfm_ppl.filtering.grid_layout import GridLayout, padded_size
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.map_draws import BatchStore, map_draws
+from lfm_ppl.inference.draw_batches import BatchStore, map_draws
 from lfm_ppl.inference.path_plan import PathPlan, first_simulated_times, has_forecast, plan_paths
 from lfm_ppl.inference.problem import Partition, Problem, signature
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, replicate, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.simulate import LONGEST_PRODUCT, input_breakpoints, simulate_missing_states

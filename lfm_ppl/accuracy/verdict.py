@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from lfm_ppl.accuracy.importance_weights import LARGEST_K
+from lfm_ppl.accuracy.log_likelihoods import finer_tolerance
 from lfm_ppl.results.convergence import join_names
-from lfm_ppl.results.importance import LARGEST_K
-from lfm_ppl.results.likelihoods import finer_tolerance
 
 SHIFT = 0.1
 """Change of a mean, in posterior sds, that does not matter."""
@@ -48,7 +48,7 @@ _SIGMAS = 2.0
 
 @dataclass(frozen=True)
 class Findings:
-    """What a verdict rests on; see `lfm_ppl.results.accuracy.AccuracyReport` for the numbers.
+    """What a verdict rests on; see `lfm_ppl.accuracy.check_accuracy.AccuracyReport` for the numbers.
 
     Attributes:
         table: of the parameters.

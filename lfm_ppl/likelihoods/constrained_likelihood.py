@@ -33,8 +33,8 @@ from lfm_ppl.filtering.problem import at_intervals
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import Sites
-from lfm_ppl.inference.marginal_likelihood import CONSTRAINTS, MarginalLikelihood
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood, check_model, repeat_draw
+from lfm_ppl.likelihoods.marginal_likelihood import CONSTRAINTS, MarginalLikelihood
+from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood, check_model, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import noisy_observation

@@ -18,9 +18,9 @@ import numpy as np
 import numpyro.distributions as dist
 from numpy.typing import ArrayLike
 
-from lfm_ppl.inference.handlers.likelihood_handler import Handler
-from lfm_ppl.inference.handlers.pinned import Pinned, elementwise
-from lfm_ppl.inference.priors import support as in_words
+from lfm_ppl.likelihoods.handlers.likelihood_handler import Handler
+from lfm_ppl.likelihoods.handlers.pinned import Pinned, elementwise
+from lfm_ppl.likelihoods.priors import support as in_words
 from lfm_ppl.utils import checks
 
 _ELEMENT = re.compile(r"^(?P<site>[^\[\]]+)\[(?P<label>[^\[\]]+)\]$")

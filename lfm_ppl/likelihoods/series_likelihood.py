@@ -36,7 +36,7 @@ from lfm_ppl.filtering.smoother import SmootherResult, filtered_mean, smooth_on
 from lfm_ppl.filtering.stiffness import ExplicitSteps, explicit_steps, warn_of_long_steps
 from lfm_ppl.filtering.time_grid import build_time_grid, lay_out_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
-from lfm_ppl.inference.likelihood import Likelihood
+from lfm_ppl.likelihoods.likelihood import Likelihood
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.events import EventTable, event_table

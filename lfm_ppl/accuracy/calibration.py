@@ -23,7 +23,7 @@ from numpyro import handlers
 from scipy import stats
 
 from lfm_ppl.inference.bind import bind
-from lfm_ppl.inference.likelihood_site import likelihood_site
+from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 from lfm_ppl.parallel.cluster import Workers
 from lfm_ppl.parallel.run import run_tasks
 from lfm_ppl.parallel.task import Task

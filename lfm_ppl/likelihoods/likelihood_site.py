@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import jax
 from numpyro import handlers
 
-from lfm_ppl.inference.handlers.likelihood_handler import LikelihoodHandler
-from lfm_ppl.inference.likelihood import Likelihood
-from lfm_ppl.inference.problem import SiteTimes
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.filtering.grid_layout import GridLayout
+from lfm_ppl.likelihoods.handlers.likelihood_handler import LikelihoodHandler
+from lfm_ppl.likelihoods.likelihood import Likelihood
+from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.utils import checks
 
 
@@ -79,6 +79,18 @@ def single_site(sites: Sequence[LikelihoodSite], name: str | None = None) -> Lik
     raise ValueError(f"one likelihood site is expected here, and the model has {names}: pass times and data by site, "
                      f"lfm.fit(model, {{{', '.join(f'{site.name!r}: (times, y)' for site in sites)}}}), which calls "
                      f"model(times, y) with dicts; of a bound model take bound.site_models[{sites[0].name!r}].")
+
+
+class SiteTimes(NamedTuple):
+    """Times of a likelihood site that do not depend on the parameters.
+
+    Attributes:
+        times: (T,), or (B, T) for a panel.
+        layout: layout of the time grid; None where the likelihood lays it out itself.
+    """
+
+    times: Any
+    layout: GridLayout | None = None
 
 
 class replace_times(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.inference.handlers.pinned import Pinned
+from lfm_ppl.likelihoods.handlers.pinned import Pinned
 
 if TYPE_CHECKING:
     from lfm_ppl.model.latent_force_model import LatentForceModel

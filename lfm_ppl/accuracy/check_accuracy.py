@@ -22,19 +22,20 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from lfm_ppl.accuracy import importance_weights, log_likelihoods
+from lfm_ppl.accuracy.approximation import finite_sd, more_iterations
+from lfm_ppl.accuracy.log_likelihoods import LikelihoodProblem, Reference, ReferenceSettings
+from lfm_ppl.accuracy.report import EXACT, GROUP, AccuracyReport
+from lfm_ppl.accuracy.verdict import NOISE_SD, NOISE_SHARE, Findings, judge
 from lfm_ppl.inference.model_digest import model_digest
-from lfm_ppl.inference.posterior import evenly_spaced
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS, SAMPLERS
+from lfm_ppl.inference.trajectories import evenly_spaced
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
-from lfm_ppl.results import arviz_data, importance, likelihoods, rebuilding, run_record
+from lfm_ppl.results import arviz_data, rebuilding, run_record
 from lfm_ppl.results import checkpoint as checkpoints
-from lfm_ppl.results.approximation import finite_sd, more_iterations
-from lfm_ppl.results.likelihoods import LikelihoodProblem, Reference, ReferenceSettings
-from lfm_ppl.results.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.results.scalars import choose, scalar_draws
 from lfm_ppl.results.sites import select_site
-from lfm_ppl.results.verdict import NOISE_SD, NOISE_SHARE, Findings, judge
 from lfm_ppl.utils import checks
 
 REFERENCES = ("auto", "grid", "particles")
@@ -146,17 +147,17 @@ def _report(result: Any, problem: LikelihoodProblem, draw_index: np.ndarray,
     posterior = arviz_data.group(result, "posterior")
     shape = (posterior.sizes["chain"], len(draw_index))
     sites = problem.sites
-    filtered = {name: likelihoods.gaussian(site).reshape(shape) for name, site in sites.items()}
+    filtered = {name: log_likelihoods.gaussian(site).reshape(shape) for name, site in sites.items()}
     for name, site in sites.items():
         site_result = select_site(result, name) if arviz_data.sites_of(result) else result
-        recorded = likelihoods.recorded(site, filtered[name].ravel()).reshape(shape)
+        recorded = log_likelihoods.recorded(site, filtered[name].ravel()).reshape(shape)
         rebuilding.check_likelihood(site_result, recorded, draw_index)
-    doubled = [likelihoods.gaussian(site, "log likelihoods with finer steps", **likelihoods.finer_steps(site.example))
-               for site in sites.values()]
+    doubled = [log_likelihoods.gaussian(site, "log likelihoods with finer steps",
+                                        **log_likelihoods.finer_steps(site.example)) for site in sites.values()]
     iterated, refinements = dict(filtered), {name: more_iterations(site.example) for name, site in sites.items()}
     for name, refinement in refinements.items():
         if refinement is not None:
-            iterated[name] = likelihoods.gaussian(sites[name], "log likelihoods with more iterations",
+            iterated[name] = log_likelihoods.gaussian(sites[name], "log likelihoods with more iterations",
                                                   **refinement.settings).reshape(shape)
     references = {name: _reference(site, filtered[name], settings[name], len(sites)) for name, site in sites.items()}
     return _assess(result, draw_index, np.sum([*filtered.values()], axis=0), np.sum(doubled, axis=0).reshape(shape),
@@ -187,10 +188,10 @@ def _assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: 
     averaged = _summed(reference.estimates.reshape(*filtered.shape, *reference.estimates.shape[1:]))
     ratio = averaged.log_mean - filtered
     efficiency = _relative_efficiency(filtered)
-    weights = importance.smooth(ratio, efficiency)
+    weights = importance_weights.smooth(ratio, efficiency)
     all_draws = scalar_draws(posterior)
     varying = {label: all_draws[label] for label in choose(all_draws, None)}
-    table = importance.corrected_moments(varying, draw_index, weights.log_weight)
+    table = importance_weights.corrected_moments(varying, draw_index, weights.log_weight)
     noisy = reference.estimates.shape[-1] > 1
     noise_sd = noise(averaged) if noisy else 0.0
     change = doubled - filtered
@@ -225,7 +226,7 @@ def _assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: 
         "remedies": json.dumps(verdict.remedies)}))
 
 
-def noise(averaged: importance.Averaged) -> float:
+def noise(averaged: importance_weights.Averaged) -> float:
     """Return the root mean square, over draws, of the noise sd of averaged log likelihoods."""
     variances = averaged.variance[~np.isnan(averaged.variance)]
     return float(np.sqrt(np.minimum(variances, _LARGEST_VARIANCE).mean())) if variances.size else np.inf
@@ -289,7 +290,7 @@ def _kind(reference: str, ssm: StateSpaceModel) -> str:
                          f"{', '.join(names)} (a force counts with its derivatives). Use reference='particles'.")
     if reference != "auto":
         return reference
-    if likelihoods.is_exact(ssm):
+    if log_likelihoods.is_exact(ssm):
         return "none"
     return "grid" if one_state and _noisy(ssm) else "particles"
 
@@ -306,7 +307,7 @@ def _reference(problem: LikelihoodProblem, filtered: np.ndarray, settings: Refer
     if settings.kind == "none":
         return Reference(filtered.reshape(-1, 1, 1), f"{EXACT}: for this linear model the Gaussian filter is exact")
     if settings.kind == "grid":
-        return likelihoods.on_grid(problem, settings)
+        return log_likelihoods.on_grid(problem, settings)
 
     def is_settled(estimates: np.ndarray) -> bool:
         averaged = _summed(estimates)
@@ -314,14 +315,14 @@ def _reference(problem: LikelihoodProblem, filtered: np.ndarray, settings: Refer
         if not np.isfinite(ratio).any():
             return False
         is_noisy = _share(noise(averaged), ratio) > NOISE_SHARE
-        return importance.smooth(ratio, _relative_efficiency(filtered)).reliable or not is_noisy
+        return importance_weights.smooth(ratio, _relative_efficiency(filtered)).reliable or not is_noisy
 
-    return likelihoods.by_particles(
+    return log_likelihoods.by_particles(
         problem, settings, lambda estimates: noise(_summed(estimates)), NOISE_SD / np.sqrt(count), _MOST_WORK,
         is_settled)
 
 
-def _summed(estimates: np.ndarray) -> importance.Averaged:
+def _summed(estimates: np.ndarray) -> importance_weights.Averaged:
     """Return the averages over replicates of log likelihoods (..., B, R), summed over the series."""
-    averaged = importance.average(estimates)
-    return importance.Averaged(averaged.log_mean.sum(axis=-1), averaged.variance.sum(axis=-1))
+    averaged = importance_weights.average(estimates)
+    return importance_weights.Averaged(averaged.log_mean.sum(axis=-1), averaged.variance.sum(axis=-1))

@@ -8,7 +8,7 @@ from typing import Any
 import numpyro.distributions as dist
 from numpyro.primitives import Messenger
 
-from lfm_ppl.inference.likelihood import Likelihood
+from lfm_ppl.likelihoods.likelihood import Likelihood
 
 
 class Handler(Messenger):

@@ -16,8 +16,9 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl.results import arviz_data, importance, tables
-from lfm_ppl.results.verdict import Verdict
+from lfm_ppl.accuracy import importance_weights
+from lfm_ppl.accuracy.verdict import Verdict
+from lfm_ppl.results import arviz_data, tables
 
 GROUP = "accuracy"
 EXACT = "none needed"
@@ -57,7 +58,7 @@ class AccuracyReport:
         Columns: mean, sd, corrected_mean, corrected_sd, shift (corrected mean - mean, in sds), shift_se (its Monte
         Carlo standard error), sd_ratio (corrected sd / sd), sd_ratio_se, corrected_mean_se.
         """
-        columns = {name: self.dataset[name].values for name in importance.COLUMNS}
+        columns = {name: self.dataset[name].values for name in importance_weights.COLUMNS}
         return pd.DataFrame(columns, index=[str(label) for label in self.dataset["parameter"].values])
 
     @property

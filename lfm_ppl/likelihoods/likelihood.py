@@ -31,6 +31,10 @@ class Likelihood(dist.Distribution):
     def split_key(self, key: jax.Array) -> jax.Array:
         """Return a random key for each series, or the key itself for one series."""
 
+    def with_settings(self, **settings: Any) -> Any:
+        """Return the same distribution with other settings of its filter, such as ``steps``."""
+        raise NotImplementedError
+
     @abstractmethod
     def checked(self, value: Any) -> jax.Array:
         """Return observations as an array after checking them."""

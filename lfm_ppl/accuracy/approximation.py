@@ -21,16 +21,16 @@ from typing import Any
 import jax
 import numpy as np
 
+from lfm_ppl.accuracy import log_likelihoods
+from lfm_ppl.accuracy.log_likelihoods import LikelihoodProblem
 from lfm_ppl.filtering.integrators.integrator import Stepping
 from lfm_ppl.filtering.iterated import DEFAULT_ITERATIONS
 from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.constrained_likelihood import ConstrainedLikelihood
-from lfm_ppl.inference.posterior import evenly_spaced
-from lfm_ppl.inference.series_likelihood import SeriesLikelihood
+from lfm_ppl.inference.trajectories import evenly_spaced
+from lfm_ppl.likelihoods.constrained_likelihood import ConstrainedLikelihood
+from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.resolution import resolution_messages
-from lfm_ppl.results import likelihoods
-from lfm_ppl.results.likelihoods import LikelihoodProblem
 from lfm_ppl.utils import checks
 
 _DRAWS = 20
@@ -72,7 +72,7 @@ def shorter_steps(example: SeriesLikelihood) -> Refinement | None:
     """Return half the integration step; None where nothing is integrated, or where constraints fix the steps."""
     if isinstance(example, ConstrainedLikelihood) or all(ssm.plan.has_exact_moments for ssm in example.ssms):
         return None
-    settings = likelihoods.finer_steps(example)
+    settings = log_likelihoods.finer_steps(example)
     arguments = ", ".join(f"{name}={value:g}" for name, value in settings.items())
     flags = " ".join(f"--{name.replace('_', '-')} {value:g}" for name, value in settings.items())
     return Refinement(settings, "half the integration step", f"{arguments} ({flags})")
@@ -96,11 +96,11 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
     count = len(next(iter(draws.values())))
     _, rows = evenly_spaced(1, count, min(_DRAWS, count))
     problem = LikelihoodProblem(bound, draws).select(rows)
-    fitted = likelihoods.gaussian(problem) if log_likelihood is None else log_likelihood[rows]
+    fitted = log_likelihoods.gaussian(problem) if log_likelihood is None else log_likelihood[rows]
 
     def change(*selected: Refinement) -> float:
         settings = {name: value for refinement in selected for name, value in refinement.settings.items()}
-        return finite_sd(likelihoods.gaussian(problem, **settings) - fitted)
+        return finite_sd(log_likelihoods.gaussian(problem, **settings) - fitted)
 
     total = change(*refinements)
     if total <= LARGEST_CHANGE:

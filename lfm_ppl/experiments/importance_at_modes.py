@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special, stats
 
+from lfm_ppl.accuracy import importance_weights
 from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import Minimum
-from lfm_ppl.results import importance
 
 FREEDOM = (3, 5)
 """Degrees of freedom of the first and the second t distribution."""
@@ -52,7 +52,7 @@ class Weighted(NamedTuple):
     """
 
     draws: np.ndarray
-    weights: importance.Importance
+    weights: importance_weights.Importance
     mixture_weights: np.ndarray
 
     @property
@@ -69,7 +69,7 @@ class Weighted(NamedTuple):
 
     def resampled(self, count: int, seed: int) -> np.ndarray:
         """Return (count, P) of the draws, each as often as its weight says, in random order."""
-        return self.draws[importance.resample(self.weights.log_weight, count, seed)]
+        return self.draws[importance_weights.resample(self.weights.log_weight, count, seed)]
 
 
 def weighted(log_density: Callable[[np.ndarray], np.ndarray], modes: Sequence[Minimum], count: int,
@@ -98,7 +98,7 @@ def weighted(log_density: Callable[[np.ndarray], np.ndarray], modes: Sequence[Mi
                                 for proposal, size in zip(proposals, sizes, strict=True)])
         log_t = np.stack([proposal.logpdf(draws) for proposal in proposals])
         log_ratio = log_density(draws) - special.logsumexp(log_t, axis=0, b=(sizes / sizes.sum())[:, None])
-        weights = importance.smooth(np.where(np.isfinite(log_ratio), log_ratio, -np.inf)[None])
+        weights = importance_weights.smooth(np.where(np.isfinite(log_ratio), log_ratio, -np.inf)[None])
         mass, belongs = _mixture_weights(np.exp(weights.log_weight[0]), log_t)
         about = [_next(draws, members, *component) for members, component in zip(belongs, about, strict=True)]
         share = np.maximum(mass, LEAST_SHARE)

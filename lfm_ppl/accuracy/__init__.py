@@ -1,0 +1,1 @@
+"""Everything that computes the error of a posterior: checks, references, corrections, verdicts."""
