@@ -32,7 +32,7 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
 
     Draws that the weights favour appear more than once, so that diagnostics of chains say nothing here; the report
     gives the effective number of draws. Trajectories are drawn again by the Gaussian smoother at the corrected
-    parameters; log likelihood and replicated data are those of the draws.
+    parameters; log likelihood and replicated data belong to the draws.
 
     Args:
         result: of `lfm_ppl.fit`, with the report that `check_accuracy` stored; check at many draws (1,000) first.

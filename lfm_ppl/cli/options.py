@@ -346,7 +346,7 @@ class ForecastOptions(Output):
     times: Annotated[Times, Parameter(name="*")] = Times()
     held_out: File | None = None
     """CSV file of data that the fit did not use; they are predicted and scored; its known inputs and doses (--inputs,
-    --events) continue those of the fit, and with them the outputs may all be empty"""
+    --events) continue the fit's, and with them the outputs may all be empty"""
     columns: Annotated[Columns, Parameter(name="*")] = Columns()
     time_unit: TimeUnit | None = None
     """unit of the times in that file (default: that of the fit)"""

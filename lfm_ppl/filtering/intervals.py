@@ -113,14 +113,14 @@ def by_length(grid: TimeGrid, make: Callable[[jax.Array], Any]) -> Callable[[Int
     if not leaves:
         return lambda interval: jax.tree.unflatten(tree, [])
     shapes = [leaf.shape[1:] for leaf in leaves]
-    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    offsets = np.cumsum([math.prod(shape) for shape in shapes])
     # One row for each length is read at once, and written at once in reverse mode; array by array that took many more
     # operations to compile.
     rows = jnp.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
 
     def read(interval: Intervals) -> Any:
         row = jax.lax.dynamic_index_in_dim(rows, interval.length_index, keepdims=False)
-        parts = jnp.split(row, ends[:-1])
+        parts = jnp.split(row, offsets[:-1])
         return jax.tree.unflatten(tree, [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
 
     return read

@@ -218,7 +218,7 @@ class TracedModel:
 
         Args:
             measure: function of a likelihood.
-            problem: its times are those of the likelihoods.
+            problem: it holds the times of the likelihoods.
             transformation: such as `jax.eval_shape`, of a function of z and the problem.
             *point: its further arguments, z (d,) and a problem.
             only_site: name of the site whose likelihood is measured; None: of all sites.

@@ -59,7 +59,7 @@ def keywords(result: Any, later: Mapping[str, Any] | None, overrides: Mapping[st
 
     Args:
         result: with the known inputs of the fit.
-        later: known inputs that continue those of the fit, and further arguments, see `lfm_ppl.forecast`; or None.
+        later: known inputs that continue the fit's, and further arguments, see `lfm_ppl.forecast`; or None.
         overrides: keyword arguments that replace these.
     """
     if sites := arviz_data.sites_of(result):
@@ -68,15 +68,15 @@ def keywords(result: Any, later: Mapping[str, Any] | None, overrides: Mapping[st
     stored = inputs.inputs_of(result)
     continued = stored | continued_tables(result, later or {})
     arguments = model_keywords(stored, overrides)
-    others = {name: value for name, value in (later or {}).items() if name not in stored}
-    if len(others) < len(later or {}):
+    further = {name: value for name, value in (later or {}).items() if name not in stored}
+    if len(further) < len(later or {}):
         functions = as_inputs(continued)
         for name, value in (later or {}).items():
             if name in functions and isinstance(value, Input):
                 functions[name] = Input(*continued[name][:3], outside=value.outside, name=name)
         from_tables = {"inputs": {**arguments.get("inputs", {}), **functions}, "events": as_events(continued)}
         arguments |= {name: value for name, value in from_tables.items() if value}
-    return arguments | others
+    return arguments | further
 
 
 def continued_tables(result: Any, later: Mapping[str, Any]) -> dict[str, InputTable]:
@@ -144,7 +144,7 @@ def _check_function(name: str, stored: InputTable, table: InputTable, first: flo
         time, end = calendar_time.named(float(knots[row])), calendar_time.named(last)
         raise ValueError(f"the known input {name!r} of the forecast is {later[row]:g} at time {time}, where that of "
                          f"the fit is {earlier[row]:g}. Until the last observation, at time {end}, they must be the "
-                         "same: give later rows only, which continue those of the fit, or fit again.")
+                         "same: give later rows only, which continue the fit's, or fit again.")
 
 
 def _check_doses(name: str, stored: InputTable, table: InputTable, first: float, last: float) -> None:
@@ -166,12 +166,13 @@ def _check_doses(name: str, stored: InputTable, table: InputTable, first: float,
         amounts = [entries.get((time, state), np.nan) for entries in (later, earlier)]
         if np.isclose(amounts[0], amounts[1], rtol=_TOLERANCE, atol=0.0):
             continue
-        given, fitted = ("none" if np.isnan(amount) else state if state == "a reset" else f"{amount:g} to {state}"
-                         for amount in amounts)
-        raise ValueError(f"the doses {name!r} of the forecast at time {calendar_time.named(time)} are {given}, where "
-                         f"those of the fit are {fitted}. Before the last observation, at time "
+        forecast_dose, fitted_dose = (
+            "none" if np.isnan(amount) else state if state == "a reset" else f"{amount:g} to {state}"
+            for amount in amounts)
+        raise ValueError(f"the doses {name!r} of the forecast at time {calendar_time.named(time)} are {forecast_dose}, "
+                         f"where those of the fit are {fitted_dose}. Before the last observation, at time "
                          f"{calendar_time.named(last)}, they must be the same: give later doses only, which continue "
-                         "those of the fit, or fit again.")
+                         "the fit's, or fit again.")
 
 
 def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None,

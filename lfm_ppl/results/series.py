@@ -154,7 +154,7 @@ def panel_of(result: Any) -> tuple[Any, Any]:
     is_selected = xr.DataArray(np.arange(len(labels)) == index, dims=dimension)
 
     def without_others(dataset: xr.Dataset, fill: float) -> xr.Dataset:
-        # Rows pad the series again, so that its draws are those of a forecast of the panel.
+        # Rows pad the series again, so that its draws equal a forecast of the panel.
         rows, size = np.arange(panel["rows"]), dataset.sizes["time"]
         dataset = dataset.isel(time=np.minimum(rows, size - 1)).where(xr.DataArray(rows < size, dims="time"), fill)
         names = list(dataset.data_vars)

@@ -2,8 +2,8 @@
 
 1. Parameters, statistics of the sampler and the accuracy check are common to all sites.
 2. Groups of observed entries hold one variable for each site, with a dimension of its own: ``y`` over
-   ``y_observation``. There the log likelihood has no coordinates, which ArviZ cannot stack across variables; they are
-   those of the observed data.
+   ``y_observation``. There the log likelihood has no coordinates, which ArviZ cannot stack across variables; the
+   observed data have them.
 3. Every other group belongs to one site and has its name: ``trajectories_y``.
 4. `select_site` keeps the groups of the data of other sites, which the model needs for a forecast.
 """
@@ -125,10 +125,11 @@ def all_sites_of(result: Any) -> tuple[Any, str]:
     attributes = arviz_data.attributes(result)
     selected = json.loads(attributes[_SELECTED])
     name, settings = selected["name"], selected["sites"]
-    own = {group: arviz_data.group(result, group) for group in ("posterior", _DATA, "one_step_ahead", inputs.GROUP)
-           if arviz_data.has_group(result, group)}
-    own[_DATA] = own[_DATA].rename({_VARIABLE: name})
-    groups = merge_sites({name: own})
+    groups_of_site = {group: arviz_data.group(result, group)
+                      for group in ("posterior", _DATA, "one_step_ahead", inputs.GROUP)
+                      if arviz_data.has_group(result, group)}
+    groups_of_site[_DATA] = groups_of_site[_DATA].rename({_VARIABLE: name})
+    groups = merge_sites({name: groups_of_site})
     groups |= {group: arviz_data.group(result, group) for group in arviz_data.groups(result)
                if group.startswith((f"{inputs.GROUP}_", f"{_DATA}_")) and group not in groups}
     differing = {key for site in settings.values() for key in site}

@@ -35,12 +35,12 @@ class SiteData(NamedTuple):
     labelled_y: Any
 
     @classmethod
-    def of(cls, given: Any, on_clock: Any) -> SiteData:
+    def of(cls, data: Any, on_clock: Any) -> SiteData:
         """Return the data of a site from what was passed, `Data` or (times, y), and the same on the model's clock."""
         on_clock = on_clock if isinstance(on_clock, Data) else None
-        if isinstance(given, Data):
-            return cls(on_clock, given.units.get("time"), None)
-        return cls(on_clock, None, given[1])
+        if isinstance(data, Data):
+            return cls(on_clock, data.units.get("time"), None)
+        return cls(on_clock, None, data[1])
 
 
 class BoundData(NamedTuple):

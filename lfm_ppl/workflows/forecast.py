@@ -59,14 +59,14 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
             or a dict for some.
         inputs: what goes on after the fit, by name, see below; or a `lfm_ppl.Data` with later known inputs, whose times
             are converted to the clock of the fit. With several likelihood sites a dict by site.
-        events: `lfm_ppl.Dose`, `lfm_ppl.Infusion` and `lfm_ppl.Reset` after the last observation, which follow those of
-            the fit in the argument ``events`` of the model. With several likelihood sites a dict by site.
+        events: `lfm_ppl.Dose`, `lfm_ppl.Infusion` and `lfm_ppl.Reset` after the last observation, which follow the
+            fit's in the argument ``events`` of the model. With several likelihood sites a dict by site.
         model_kwargs: keyword arguments of the model, as in the fit.
         draws: number of posterior draws, spread over the chains, each with a path of its own.
         seed: of the paths and the noise.
         progress: show on standard error how far it is.
 
-    Known inputs and doses of the data CONTINUE those of the fit: the rows of the fit before the first time of the new
+    Known inputs and doses of the data CONTINUE the fit's: the rows of the fit before the first time of the new
     table stay, and the new rows follow. A table that begins with, or before, that of the fit replaces it. Until the
     last observation both must be the same, since the posterior belongs to them. A table is (times, values), (times,
     values, interpolation) or an `lfm_ppl.Input`, and of doses (times, amounts, "dose:STATE"). In a panel each series
@@ -187,7 +187,7 @@ def _check_events(result: Result, events: Sequence[Event], numpyro_model: Callab
     """Raise ValueError unless events come after the last observation of one series, and the model takes them."""
     if series_dimension(result) is not None:
         raise ValueError("events: each series of a panel has doses of its own; give inputs={'NAME of series LABEL': "
-                         "(times, amounts, 'dose:STATE')}, which continue those of the data.")
+                         "(times, amounts, 'dose:STATE')}, which continue the data's.")
     if "events" not in _arguments(numpyro_model):
         raise ValueError("events: the model has no argument `events` to take them by.")
     _, last = rebuilding.observed_span(result)
@@ -197,7 +197,7 @@ def _check_events(result: Result, events: Sequence[Event], numpyro_model: Callab
         if np.min(event.event_times, initial=np.inf) < last:
             time, end = calendar_time.named(float(np.min(event.event_times))), calendar_time.named(last)
             raise ValueError(f"events: {event.label} at time {time} lies before the last observation, at time {end}; "
-                             "events of the forecast follow those of the fit.")
+                             "events of the forecast follow the fit's.")
 
 
 def _arguments(numpyro_model: Callable) -> dict[str, inspect.Parameter]:
@@ -209,7 +209,7 @@ def _arguments(numpyro_model: Callable) -> dict[str, inspect.Parameter]:
 
 def _continued_rows(later: Mapping[str, Any], model_kwargs: Mapping[str, Any], result: Result,
                     times: np.ndarray) -> tuple[dict[str, Any], bool]:
-    """Return later arguments, of which rows follow those of the fit, and whether any do.
+    """Return later arguments, of which rows follow the fit's, and whether any do.
 
     An argument has rows if its array in ``model_kwargs`` has one for each row of the data, (T, ...), or of a panel
     (B, T, ...). The later array then has one for each of ``times`` (K,) or (B, K).
@@ -227,7 +227,7 @@ def _continued_rows(later: Mapping[str, Any], model_kwargs: Mapping[str, Any], r
         expected = (*earlier.shape[:lead - 1], times.shape[-1], *earlier.shape[lead:])
         if value.shape != expected:
             raise ValueError(f"inputs: {name!r} has shape {value.shape}, expected {expected}, a row for each time of "
-                             "the forecast, which follows those of the data in model_kwargs.")
+                             "the forecast, which follows the rows in model_kwargs.")
         arguments[name], has_rows = np.concatenate([earlier, value], axis=lead - 1), True
     return arguments, has_rows
 
@@ -241,7 +241,7 @@ def _with_later_rows(result: Result, later_times: np.ndarray) -> dict[str, np.nd
     times, y = rebuilding.observations(result)
     later = np.broadcast_to(later_times, (*times.shape[:-1], later_times.shape[-1]))
     if (later[..., :1] < times[..., -1:]).any():
-        raise ValueError(f"times: rows of arguments that follow those of the data are for times after the data, which "
+        raise ValueError(f"times: later rows of arguments are for times after the data, which "
                          f"end at {times[..., -1].max():g}, got {later.min():g}.")
     missing = np.full((*y.shape[:-2], later.shape[-1], y.shape[-1]), np.nan)
     return {"times": np.concatenate([times, later], axis=-1), "y": np.concatenate([y, missing], axis=-2)}
@@ -256,9 +256,10 @@ def _forecast_selected(result: Result, numpyro_model: Callable, times: Times, in
         ahead = select_series(forecast(panel, numpyro_model, times, inputs=of_all_series(result, later), **options),
                               label)
     else:
-        whole, name = all_sites_of(result)
+        result_of_all, name = all_sites_of(result)
         options = {**options, "events": {name: options["events"]}}
-        ahead = select_site(forecast(whole, numpyro_model, {name: times}, inputs={name: inputs}, **options), name)
+        ahead = select_site(
+            forecast(result_of_all, numpyro_model, {name: times}, inputs={name: inputs}, **options), name)
     groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)
               if name not in (GROUP, HELD_OUT, known_inputs.FORECAST)}
     groups |= {name: arviz_data.group(ahead, name) for name in (GROUP, known_inputs.FORECAST)
@@ -275,7 +276,7 @@ def _checked(times: Any) -> np.ndarray:
 
 def _forecast(key: jax.Array, result: Any, problem: LikelihoodProblem, times: np.ndarray,
               draws: int, progress: bool, has_rows: bool) -> dict[str, xr.Dataset]:
-    """Return the groups of a forecast of one site; ``has_rows`` if the last rows of the data are those of ``times``."""
+    """Return the groups of a forecast of one site; ``has_rows`` if the last rows of the data have these times."""
     bound = problem.bound
     check_possible(bound, times, has_rows)
     posterior = arviz_data.group(result, "posterior")

@@ -58,7 +58,7 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any =
 
     Returns:
         A figure with one panel per output, and for each series of a panel. Ticks at the top mark the times of missing
-        values, triangles at the bottom those of doses in the data.
+        values, triangles at the bottom the times of doses.
 
     Raises:
         ValueError: a group is missing, or an output is unknown.
@@ -444,9 +444,9 @@ def _draw_events(axes: Axes, result: Any) -> None:
     resets = np.concatenate([np.zeros(0), *(table.resets for table in tables if table.resets is not None)])
     is_infusion = (durations > 0) & (doses <= end)
     if is_infusion.any():
-        ends = np.minimum(doses + durations, end)[is_infusion]
-        axes.hlines(np.full(len(ends), 0.03), doses[is_infusion], ends, color=style.PURPLE, lw=1.5, label="infusion",
-                    **height)
+        end_times = np.minimum(doses + durations, end)[is_infusion]
+        axes.hlines(np.full(len(end_times), 0.03), doses[is_infusion], end_times, color=style.PURPLE, lw=1.5,
+                    label="infusion", **height)
     for times, marker, label in ((doses[(durations == 0) & (doses <= end)], "^", "dose"),
                                  (resets[resets <= end], "v", "reset")):
         if len(times):
