@@ -76,8 +76,7 @@ class SmootherResult(eqx.Module):
         input_mean, input_covariance: (K, M + R), (K, M + R, M + R) of w = (x, u).
         log_likelihood: (T,), log p(y_k | y_1:k-1).
         leave_one_out: (T,), log p(y_k | y_-k).
-        entry_leave_one_out: (T, D), log p of each entry of y given all other entries; without a meaning where the entry
-            is missing.
+        entry_leave_one_out: (T, D), log p of each entry of y given all other entries; zero where the entry is missing.
         whitened_innovation: (T, D), innovations whitened by their Cholesky factor, or randomised quantile residuals
             of an observation family, NaN where missing.
         change: largest change of a smoothed mean in the last iteration, in smoothed standard deviations; NaN
@@ -269,8 +268,8 @@ def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int,
     residual = whitened_innovations(at_data, y)
     log_likelihood = jnp.where(jnp.isnan(at_data.log_likelihood), -jnp.inf, at_data.log_likelihood)
     return trace, smoothed.moments, {
-        "log_likelihood": log_likelihood, "leave_one_out": left_out, "entry_leave_one_out": entries,
-        "whitened_innovation": residual, "change": change,
+        "log_likelihood": log_likelihood, "leave_one_out": left_out,
+        "entry_leave_one_out": jnp.where(jnp.isnan(y), 0.0, entries), "whitened_innovation": residual, "change": change,
         "log_likelihood_change": at_data.log_likelihood.sum() - previous, "converged": jnp.asarray(True)}
 
 
@@ -292,9 +291,9 @@ def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings,
     change = jnp.asarray(jnp.nan) if points is None else fixed_point.change
     residual = quantile_residuals(family, prequential.prediction, y)
     return result.trace, smoothed.moments, {
-        "log_likelihood": one_step_ahead, "leave_one_out": left_out, "entry_leave_one_out": entries,
-        "whitened_innovation": residual, "change": change, "log_likelihood_change": jnp.asarray(jnp.nan),
-        "converged": fixed_point.converged}
+        "log_likelihood": one_step_ahead, "leave_one_out": left_out,
+        "entry_leave_one_out": jnp.where(jnp.isnan(y), 0.0, entries), "whitened_innovation": residual, "change": change,
+        "log_likelihood_change": jnp.asarray(jnp.nan), "converged": fixed_point.converged}
 
 
 _compiled_smooth = shared_jit(smooth_on)

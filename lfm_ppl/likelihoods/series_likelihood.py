@@ -313,7 +313,7 @@ class SeriesLikelihood(Likelihood):
         """Return scores of ``y`` (T, D), and new data along a path given ``y``.
 
         Returns:
-            "leave_one_out" (T, D), log p of each entry given all others, without a meaning where it is missing;
+            "leave_one_out" (T, D), log p of each entry given all others, zero where it is missing;
             "one_step_ahead" (T,); "residual" and "replicate" (T, D).
         """
         keys = split_by_name(key, ("path", "noise"))

@@ -349,7 +349,7 @@ def test_enough_particles_are_found(bent):
     """The pilot raises the number until the noise is below its target."""
     problem = rebuilding.problem(bent, well).select(np.arange(0, 400, 25))
     settings = log_likelihoods.ReferenceSettings("particles", None, 2)
-    noise = lambda e: check_accuracy.noise(importance_weights.average(e))  # noqa: E731
+    noise = lambda e: accuracy_check.noise(importance_weights.average(e))  # noqa: E731
     result = log_likelihoods.by_particles(problem, settings, noise, 0.02, 1e12)
     assert result.particles > 1000 and not result.limited
     assert noise(result.estimates) < 0.03
@@ -373,7 +373,7 @@ def test_more_particles_are_run_only_until_the_verdict_is_settled(bent, monkeypa
 
 def test_replicates_of_each_series_are_averaged_apart():
     likelihood = np.array([[[1.0, 3.0], [2.0, 6.0]]])  # one draw, two series, two replicates
-    averaged = check_accuracy._summed(np.log(likelihood))
+    averaged = accuracy_check._summed(np.log(likelihood))
     np.testing.assert_allclose(averaged.log_mean, np.log(2.0 * 4.0))
     parts = importance_weights.average(np.log(likelihood[0]))
     np.testing.assert_allclose(averaged.variance, parts.variance.sum())
@@ -434,8 +434,8 @@ def test_the_grid_is_not_for_models_with_events():
     model = lfm.LatentForceModel(
         lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1), events=[lfm.Dose([1.0], 1.0, "x0")])
-    assert check_accuracy._kind("auto", lfm.state_space(model)) == "particles"
+    assert accuracy_check._kind("auto", lfm.state_space(model)) == "particles"
     with pytest.raises(ValueError, match="events"):
-        check_accuracy._kind("grid", lfm.state_space(model))
+        accuracy_check._kind("grid", lfm.state_space(model))
     with pytest.raises(ValueError, match="events"):
         lfm.fokker_planck(model, np.arange(3.0), np.ones((3, 1)))
