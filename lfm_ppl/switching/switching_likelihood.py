@@ -296,7 +296,8 @@ class Switching(SeriesLikelihood):
         entries = smooth_path(regimes, y, path).entry_leave_one_out[observed]
         states, times = sample_states(keys["states"], regimes, y, path)[observed], jnp.asarray(self.times, float)
         w = self._inputs_of_regimes(states, path[observed], times)
-        return {"leave_one_out": jnp.where(jnp.isnan(y), 0.0, entries), "one_step_ahead": trace.log_likelihood[observed],
+        return {"leave_one_out": jnp.where(jnp.isnan(y), 0.0, entries),
+                "one_step_ahead": trace.log_likelihood[observed],
                 "residual": trace.residual[observed], "replicate": replicate(self.ssm, keys["noise"], w, times)}
 
     def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:

@@ -11,6 +11,7 @@ import xarray as xr
 from scipy import stats
 
 import lfm_ppl as lfm
+from lfm_ppl.accuracy import check_accuracy as accuracy_check
 from lfm_ppl.accuracy import importance_weights, log_likelihoods
 from lfm_ppl.accuracy.check_accuracy import check_accuracy
 from lfm_ppl.accuracy.correction import correct_posterior
