@@ -74,6 +74,7 @@ class BoundModel:
         model: the NumPyro model.
         traced: the model without its data.
         problem: data, times and inputs as the argument of each program.
+        model_data: the data of all sites.
         constants: the same with times and inputs as constants, for functions that need their values.
     """
 
@@ -81,6 +82,8 @@ class BoundModel:
                  selected: str | None = None) -> None:
         self.traced, self.constants, self.problem, self.programs = traced, constants, problem, programs
         self.names, self.size, self.sites, self.model = traced.names, traced.size, traced.sites, traced.model
+        # One object: data that are constants are built anew by each call of `observations`.
+        self.model_data: Any = problem.observations
         self._selected = selected
         self._trace: dict[str, Any] | None = None
         self._modifications: dict[Hashable, BoundModel] = {}
@@ -90,12 +93,9 @@ class BoundModel:
            programs: Programs | None = None) -> BoundModel:
         """Bind a NumPyro model to its arguments, the last of which is its data; see `trace_model`."""
         programs = programs or Programs()
-        return cls(*trace_model(model, arguments, keywords, caller, programs), programs)
-
-    @property
-    def model_data(self) -> Any:
-        """The data of all sites."""
-        return self.problem.observations
+        traced, constants, problem = trace_model(model, arguments, keywords, caller, programs)
+        # Programs of constants serve no other data set, and end with the bound model.
+        return cls(traced, constants, problem, programs if problem.has_traced_inputs else Programs())
 
     @property
     def y(self) -> Any:
@@ -121,8 +121,11 @@ class BoundModel:
         """
         if not self.is_by_site or self._selected is not None:
             return {self.site.name: self}
-        return {name: BoundModel(self.traced, self.constants, self.problem, self.programs, name)
-                for name in self.constants.call()[0][0]}
+        models = {name: BoundModel(self.traced, self.constants, self.problem, self.programs, name)
+                  for name in self.constants.call()[0][0]}
+        for model in models.values():
+            model._modifications = self._modifications
+        return models
 
     @property
     def times(self) -> Any:
@@ -164,11 +167,17 @@ class BoundModel:
         """
         y = self._checked(self._of_all_sites(y))
         if self.problem.data is not None:
-            return BoundModel(self.traced, self.constants.with_data(y), self.problem.with_data(y), self.programs,
-                              self._selected)
+            return self._with_checked_data(y)
         arguments, keywords = self.constants.call()
         bound = BoundModel.of(self.model, (*arguments[:-1], y), keywords, self.traced.caller, self.programs)
         bound._selected = self._selected
+        return bound
+
+    def _with_checked_data(self, y: Any) -> BoundModel:
+        """Return the same model with other data that are an argument of its programs."""
+        bound = BoundModel(self.traced, self.constants.with_data(y), self.problem.with_data(y), self.programs,
+                           self._selected)
+        bound._modifications = self._modifications
         return bound
 
     def data(self, y: ArrayLike | Mapping[str, Any] | Problem | None = None) -> Any:
@@ -240,8 +249,8 @@ class BoundModel:
 
     def log_likelihood(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
         """Return log p(y | T(z)), summed over all sites and the series of a panel; arguments as `log_density`."""
-        def log_likelihood(z: jax.Array, y: Any) -> jax.Array:
-            sites = [model._site_at(z, y) for model in self.site_models.values()]
+        def log_likelihood(z: jax.Array, problem: Problem) -> jax.Array:
+            sites = [model._site_at(z, problem) for model in self.site_models.values()]
             return jnp.stack([site.distribution.log_prob(site.observed).sum() for site in sites]).sum()
 
         run = self.program("log likelihood", lambda: Program(log_likelihood))
@@ -251,7 +260,7 @@ class BoundModel:
         """Return the log prior density of the unconstrained parameters, Jacobian included."""
         traced = self.traced
         run = self.program("log prior", lambda: Program(
-            lambda z, y: -traced.potential(z, y, remove_likelihood)))
+            lambda z, problem: -traced.potential(z, problem, remove_likelihood)))
         return run(self._position(z), self.problem_of(y))
 
     def site_log_priors(self, values: Mapping[str, Any], y: Any = None) -> dict[str, jax.Array]:
@@ -280,7 +289,7 @@ class BoundModel:
         density_and_gradient = self.gradient(is_forward, jacobian)
 
         def minus(z: Any) -> tuple[Any, Any]:
-            value, gradient = density_and_gradient(jnp.asarray(z, float), self.model_data)
+            value, gradient = density_and_gradient(jnp.asarray(z, float), self.problem)
             return -np.asarray(value), -np.asarray(gradient)  # no further programs
 
         if not exact_hessian:
@@ -298,8 +307,8 @@ class BoundModel:
         """Return the log density of z and y, of the unconstrained or of the constrained parameters."""
         traced = self.traced
         if jacobian:
-            return lambda z, y: -traced.potential(z, y)
-        return lambda z, y: -traced.constrained_potential(z, y)
+            return lambda z, problem: -traced.potential(z, problem)
+        return lambda z, problem: -traced.constrained_potential(z, problem)
 
     def log_density_with(self, handler: Callable[[Callable], Callable], z: ArrayLike,
                          y: ArrayLike | None = None) -> jax.Array:
@@ -433,8 +442,8 @@ class BoundModel:
         """
         self._check_single("filter")
 
-        def run(z: Any, y: Any) -> FilterResult:
-            site = self._site_at(z, y)
+        def run(z: Any, problem: Problem) -> FilterResult:
+            site = self._site_at(z, problem)
             return site.distribution.filter(site.observed)
 
         result = self.program("filter", lambda: Program(run))(_as_arrays(z), self.problem_of(y))
@@ -542,25 +551,25 @@ class BoundModel:
 
     def _modified(self, name: tuple[str, Hashable], modify: Callable[[Callable], Callable]) -> BoundModel:
         key = self._selected, *name
-        if key in self._modifications:
-            return self._modifications[key]
+        if (modified := self._modifications.get(key)) is not None:
+            return modified if modified.model_data is self.model_data else modified._with_checked_data(self.model_data)
         programs = Programs() if name[1] is None else self.programs.of_modified(key)
         modified = BoundModel.of(modify(self.model), *self.constants.call(), self.traced.caller, programs)
         modified._selected = self._selected
-        if name[1] is not None and not checks.traced(self.problem):
+        if name[1] is not None and modified.problem.data is not None and not checks.traced(self.problem):
             self._modifications[key] = modified
         return modified
 
     def program(self, name: Hashable, make: Callable[[], Any], problem: Problem | None = None) -> Any:
-        """Return the function of this name, made at the first call for problems of this structure.
+        """Return the function of this name, made at the first call for problems of this structure and these shapes.
 
         Args:
             name: everything that the function depends on besides the model and its arguments.
             make: returns the function, which takes a problem as an argument.
             problem: that problem; None: `problem`.
         """
-        structure = jax.tree.structure(self.problem if problem is None else problem)
-        key = self._selected, name, structure
+        leaves, structure = jax.tree.flatten(self.problem if problem is None else problem)
+        key = self._selected, name, structure, *((np.shape(leaf), str(leaf.dtype)) for leaf in leaves)
         if key not in self.programs.by_name:
             self.programs.by_name[key] = make()
         return self.programs.by_name[key]

@@ -171,6 +171,8 @@ def signature(value: Any) -> Hashable:
 def _leaf_signature(leaf: Any) -> Hashable:
     if checks.traced(leaf):
         return _Identity(leaf)
+    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
     if isinstance(leaf, (np.ndarray, np.generic, jax.Array)):
         return np.shape(leaf), str(np.asarray(leaf).dtype), np.asarray(leaf).tobytes()
     try:

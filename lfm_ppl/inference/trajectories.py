@@ -43,6 +43,9 @@ _FILTERS = 4
 _POINTS = 8
 """Points of the distribution of state and forces, for the bands of non-linear functions of them."""
 
+_SHIFT = 0.1
+"""Distance of the second point at which the noise of the rows is compared, in each unconstrained coordinate."""
+
 _PRODUCT = "largest product of step and rate"
 """Name of this number among the results of simulated paths."""
 
@@ -65,7 +68,7 @@ def scores(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], particle
         store: as in `map_draws`.
 
     Returns:
-        ``leave_one_out`` (S, ..., T, D), log p of each entry given all others, without a meaning where the entry is
+        ``leave_one_out`` (S, ..., T, D), log p of each entry given all others, zero where the entry is
         missing; ``one_step_ahead`` (S, ..., T); ``residual`` and ``replicate`` (S, ..., T, D); the series of a panel
         come after the draws. Under constraints ``one_step_ahead`` and ``residual`` ignore the constraints. The log
         prior density (S,) of each site has the name of the site after `LOG_PRIOR`.
@@ -80,14 +83,13 @@ def scores(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], particle
         if particles is None:
             return series.scores(key, y)
         keys = split_by_name(key, ("scores", "path", "noise"))
-        w, times = _particle_path(series, y, None, keys["path"], particles, particle_steps or series.steps)
+        w, times = _particle_path(series, y, None, keys["path"], particles, particle_steps or series.steps, 1)
         return series.scores(keys["scores"], y) | {"replicate": replicate(series.ssm, keys["noise"], w, times)}
 
     rows = bound.times.size * (1 if particles is None else particles.particles)
     problem = bound.problem if particles is None else bound.constants  # a particle filter needs the values of the times
     return map_draws(bound, ("scores", particles, particle_steps), per_draw, draws, key, rows=rows,
-                     arguments=(problem,),
-                     report=report, store=store)
+                     arguments=(problem,), report=report, store=store)
 
 
 def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
@@ -250,7 +252,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
         return {name: value if name in ("log_likelihood", _PRODUCT) else value[..., :count, :]
                 for name, value in paths.items()}
     rows = plan.rows * (1 if particles is None else particles.particles)
-    return map_draws(bound, (*name, signature(requested_times), signature(plan)), per_draw, draws, key, rows=rows,
+    return map_draws(bound, (*name, signature(requested_times), signature(vars(plan))), per_draw, draws, key, rows=rows,
                      arguments=(bound.constants,), **options)
 
 
@@ -352,11 +354,15 @@ def has_noise_of_rows(bound: BoundModel) -> bool:
     example = bound.site.example
     is_of_series = not example.ssm.model.observation.varies_with_state and np.ndim(
         example.ssm.model.observation.covariance) == 3
-    return any(map(noise_of_rows, bound.site.members if is_of_series else [example]))
+    if not is_of_series:
+        return noise_of_rows(example)
+    # Rows that are equal at one point of the parameters may differ at another.
+    another = bound.likelihood(jnp.asarray(bound.draw(jax.random.key(0))) + _SHIFT)
+    return any(map(noise_of_rows, [*bound.site.members, *another.members]))
 
 
 def _particle_path(distribution: SeriesLikelihood, y: jax.Array, requested_times: Any, key: jax.Array,
-                   particles: ParticleSettings, steps: int) -> tuple[jax.Array, jax.Array]:
+                   particles: ParticleSettings, steps: int, filters: int = _FILTERS) -> tuple[jax.Array, jax.Array]:
     """Return a path (L, M + R) of one of several particle filters, by ancestor tracing, and its times (L,).
 
     The path of a single filter has the smoothing distribution only for many particles. If the filter is chosen in
@@ -366,7 +372,7 @@ def _particle_path(distribution: SeriesLikelihood, y: jax.Array, requested_times
     grid = build_time_grid(ssm, times, steps, distribution.max_step, requested_times)
     keys = split_by_name(key, ("filters", "choice"))
     states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, grid, y, k, particles, 1, TRACING),
-                                   jax.random.split(keys["filters"], _FILTERS))
+                                   jax.random.split(keys["filters"], filters))
     best = jax.random.categorical(keys["choice"], jnp.where(jnp.isneginf(total).all(), 0.0, total))
     when = jnp.asarray(grid.requested_times, float)
     return jax.vmap(ssm.inputs)(states[best][:, 0], when), when

@@ -202,7 +202,7 @@ class ConstrainedLikelihood(SeriesLikelihood):
         fixed_point = propagated.refined.fixed_point
         sites = Sites(*(a[data, :outputs] for a in fixed_point.sites))
         value = entry_leave_one_out(at_data, sites, propagated.entries[data, :outputs])
-        return jnp.where(fixed_point.converged, value, -jnp.inf)
+        return jnp.where(jnp.isnan(y), 0.0, jnp.where(fixed_point.converged, value, -jnp.inf))
 
 
 def likelihood_with(model: LatentForceModel, times: Any, settings: Mapping[str, Any]) -> SeriesLikelihood:

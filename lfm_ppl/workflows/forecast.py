@@ -130,13 +130,15 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
     if sites:
         later = {name: later.get(name, {}) for name in sites}
     data = dict(zip(("times", "y"), rebuilding.observations(result), strict=True))
-    has_rows = {}
+    has_rows, overrides = {}, dict(model_kwargs or {})
     for name, when in requested.items():
-        later[name], has_rows[name] = _continued_rows(later[name], model_kwargs or {}, views[name], when)
-        if has_rows[name]:
+        later[name], continued = _continued_rows(later[name], model_kwargs or {}, views[name], when)
+        has_rows[name] = bool(continued)
+        overrides |= continued
+        if continued:
             extended = _with_later_rows(views[name], when)
             data = {key: {**data[key], name: value} if sites else value for key, value in extended.items()}
-    keywords = rebuilding.keywords(result, later if sites else later[""], model_kwargs)
+    keywords = rebuilding.keywords(result, later if sites else later[""], overrides)
     for name, view in views.items():
         if site_events := of_site("events", events, name, sites):
             with calendar_time.in_messages(*clocks[name]):
@@ -208,15 +210,15 @@ def _arguments(numpyro_model: Callable) -> dict[str, inspect.Parameter]:
 
 
 def _continued_rows(later: Mapping[str, Any], model_kwargs: Mapping[str, Any], result: Result,
-                    times: np.ndarray) -> tuple[dict[str, Any], bool]:
-    """Return later arguments, of which rows follow the fit's, and whether any do.
+                    times: np.ndarray) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return later arguments without rows, and the arguments whose later rows follow the fit's.
 
     An argument has rows if its array in ``model_kwargs`` has one for each row of the data, (T, ...), or of a panel
     (B, T, ...). The later array then has one for each of ``times`` (K,) or (B, K).
     """
     _, y = rebuilding.observations(result)
     stored, rows = known_inputs.inputs_of(result), y.shape[:-1]
-    arguments, has_rows = dict(later), False
+    arguments, continued = dict(later), {}
     for name, value in later.items():
         earlier: Any = model_kwargs.get(name)
         if name in stored or not all(isinstance(array, np.ndarray | jax.Array) for array in (value, earlier)):
@@ -228,8 +230,8 @@ def _continued_rows(later: Mapping[str, Any], model_kwargs: Mapping[str, Any], r
         if value.shape != expected:
             raise ValueError(f"inputs: {name!r} has shape {value.shape}, expected {expected}, a row for each time of "
                              "the forecast, which follows the rows in model_kwargs.")
-        arguments[name], has_rows = np.concatenate([earlier, value], axis=lead - 1), True
-    return arguments, has_rows
+        continued[name] = np.concatenate([earlier, arguments.pop(name)], axis=lead - 1)
+    return arguments, continued
 
 
 def _with_later_rows(result: Result, later_times: np.ndarray) -> dict[str, np.ndarray]:
@@ -289,7 +291,7 @@ def _forecast(key: jax.Array, result: Any, problem: LikelihoodProblem, times: np
     paths = trajectories(key, bound, problem.select(rows).draws, None if has_rows else times, settings,
                          report=Console() if progress else None)
     if has_rows:
-        paths = {name: value if name in ("y", "log_likelihood") else value[..., -times.shape[-1]:, :]
+        paths = {name: value if name == "log_likelihood" else value[..., -times.shape[-1]:, :]
                  for name, value in paths.items()}
     split = {name: value.reshape(chains, len(draw_index), *value.shape[1:]) for name, value in paths.items()}
     log_likelihood = split.pop("log_likelihood", None)

@@ -364,6 +364,8 @@ def _draw_new_data(axes: Axes, result: Any, name: str, predicted: xr.Dataset | N
     elif has_group(result, "posterior_predictive"):
         draws = group(result, "posterior_predictive")["y"].transpose("chain", "draw", ENTRY)
         draws = draws.isel({ENTRY: draws["output"].values == name})
+        if not draws.sizes[ENTRY]:
+            return inner[1][-1], inner[2][-1]
         band, step = _band_of_draws(draws, *inner)
     else:
         return inner[1][-1], inner[2][-1]
