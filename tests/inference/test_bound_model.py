@@ -24,6 +24,7 @@ from lfm_ppl.inference.bound_samplers import nuts_sampler, ram_sampler
 from lfm_ppl.inference.laplace_start import Laplace
 from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.schedule import Schedule
+from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.results.arviz_data import group
 from tests.compiled_programs import compilations
 
@@ -250,6 +251,21 @@ def test_a_model_that_asks_its_data_for_values():
     for y, result in ((Y, bound), (OTHER, bound.with_data(OTHER))):
         expected = numpyro_density(looks, (TIMES, y), {"decay": 0.1})
         assert float(result.log_density(z)) == pytest.approx(expected, rel=1e-12)
+
+
+def test_models_that_share_programs_may_have_other_numbers_of_series():
+    def several(times, y=None):
+        with numpyro.plate("series", y.shape[0]):
+            decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
+            numpyro.sample("y", lfm.panel(lambda p: systems.motif(systems.identity, decay=p), decay, times, steps=2),
+                           obs=y)
+
+    shared = SharedModel(several)
+    for count in (2, 3):
+        y = np.stack([Y, OTHER, Y])[:count]
+        z = 0.1 * np.arange(count)
+        result, expected = (float(lfm.bind(model, TIMES, y).log_density(z)) for model in (shared, several))
+        assert result == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_panel():

@@ -9,12 +9,12 @@ import pytest
 from numpyro.infer import MCMC
 
 import lfm_ppl as lfm
+from lfm_ppl.inference import particle_potential
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalState, particle_marginal
 from lfm_ppl.inference.kernels.robust_metropolis import Adaptation, initial_state
 from lfm_ppl.inference.particle_potential import ParticlePotential
 from lfm_ppl.inference.trajectories import trajectories
-from lfm_ppl.likelihoods import particle_likelihood
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results.arviz_data import group, summary
 
@@ -109,7 +109,7 @@ def test_the_number_of_particles_is_chosen_for_an_sd_of_one():
 
 
 def test_precise_observations_that_no_particle_meets_are_an_error(monkeypatch):
-    monkeypatch.setattr(particle_likelihood, "_MOST", 200)
+    monkeypatch.setattr(particle_potential, "_MOST", 200)
 
     def impossible(times, y=None):
         rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))

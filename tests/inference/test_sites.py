@@ -44,6 +44,24 @@ def test_other_data_of_one_site_or_of_all():
         float(lfm.bind(alone("y2"), TIMES["y2"], other["y2"]).log_likelihood(Z)), abs=1e-12)
 
 
+def test_sites_of_a_model_that_asks_its_data_for_values():
+    def looks(times, y):
+        rate = numpyro.sample("a", dist.LogNormal(float(np.nanmean(y["y"])), 0.5))
+        for name in times:
+            numpyro.sample(name, lfm.MarginalLikelihood(system(name, rate), times[name]), obs=y[name])
+
+    def known(times, y):
+        rate = numpyro.sample("a", dist.LogNormal(float(np.nanmean(Y["y"])), 0.5))
+        for name in times:
+            numpyro.sample(name, lfm.MarginalLikelihood(system(name, rate), times[name]), obs=y[name])
+
+    bound, expected = lfm.bind(looks, TIMES, Y), lfm.bind(known, TIMES, Y)
+    assert bound.problem.data is None
+    minus, gradient = bound.objective().value_and_gradient(Z)
+    np.testing.assert_allclose(-gradient, expected.log_density_gradient(Z)[1], rtol=1e-9)
+    assert -minus == pytest.approx(float(expected.log_density(Z)), abs=1e-10)
+
+
 def closed(times, y):
     """A model whose second site closes over its data."""
     rate = numpyro.sample("a", dist.LogNormal(-1.0, 0.5))
