@@ -120,24 +120,20 @@ def discretise_steps(
     def transition_over(times: jax.Array) -> jax.Array:
         return jnp.tensordot(series, powers(unit * times, len(series)), axes=(0, -1))
 
-    def square(phi: jax.Array) -> tuple[jax.Array]:
-        return (_product(phi, phi),)
+    def double_once(phi: jax.Array, *noise: jax.Array) -> tuple[jax.Array, ...]:
+        return _product(phi, phi), *(q + _product(_product(phi, q), phi.swapaxes(0, 1)) for q in noise)
 
-    def double_once(phi: jax.Array, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return _product(phi, phi), q + _product(_product(phi, q), phi.swapaxes(0, 1))
-
+    values: tuple[jax.Array, ...] = (transition_over(step),)
+    if has_noise:
+        nodes, weights = _quadrature(series)
+        to_end = transition_over(nodes[:, None] * step)
+        integrand = _product(_product(to_end, diffusion[:, :, None, None]), to_end.swapaxes(0, 1))
+        values = *values, step * (weights[:, None] * integrand).sum(-2)
+    phi, *noise = repeat(double_once, values, doublings, max_doublings)
     is_complete = doublings <= max_doublings
-    if not has_noise:
-        (phi,) = repeat(square, (transition_over(step),), doublings, max_doublings)
-        phi = jnp.moveaxis(jnp.where(is_complete, phi, jnp.nan), -1, 0)
-        return phi, jnp.zeros_like(phi)
-    nodes, weights = _quadrature(series)
-    to_end = transition_over(nodes[:, None] * step)
-    integrand = _product(_product(to_end, diffusion[:, :, None, None]), to_end.swapaxes(0, 1))
-    noise = step * (weights[:, None] * integrand).sum(-2)
-    phi, q = repeat(double_once, (transition_over(step), noise), doublings, max_doublings)
-    phi, q = jnp.where(is_complete, phi, jnp.nan), jnp.where(is_complete, 0.5 * (q + q.swapaxes(0, 1)), jnp.nan)
-    return jnp.moveaxis(phi, -1, 0), jnp.moveaxis(q, -1, 0)
+    phi, *noise = (jnp.moveaxis(jnp.where(is_complete, value, jnp.nan), -1, 0)
+                   for value in (phi, *(0.5 * (q + q.swapaxes(0, 1)) for q in noise)))
+    return phi, noise[0] if has_noise else jnp.zeros_like(phi)
 
 
 def _product(a: jax.Array, b: jax.Array) -> jax.Array:
