@@ -56,8 +56,8 @@ class SmootherTrace(NamedTuple):
     Attributes:
         moments: smoothed, at the N + 1 nodes.
         leave_one_out: (N,), log p(y_k | all other observations), zero in intervals without an observation.
-        entry_leave_one_out: (N, D), log p of each entry of y_k given all other entries of all observations; without a
-            meaning where the entry is missing, and (N,) of a pass without leave-one-out terms.
+        entry_leave_one_out: (N, D), log p of each entry of y_k given all other entries of all observations; zero where
+            the entry is missing, and (N,) of a pass without leave-one-out terms.
         adjoint: r (N, n) and Lambda (N, n, n) at the interval's end, its observation and all later ones included: the
             smoothed mean there is m_p + P_p r, the covariance P_p - P_p Lambda P_p.
         predictor: (N, ...), of a pass with sites, which has no leave-one-out terms; None of any other.
@@ -177,4 +177,4 @@ def _leave_one_out(update: Update, r: jax.Array, adjoint: jax.Array) -> tuple[ja
     is_positive = precisions > 0
     safe = jnp.where(is_positive, precisions, 1.0)
     entries = 0.5 * (jnp.log(safe) - u**2 / safe - np.log(2.0 * np.pi))
-    return row, jnp.where(is_positive, entries, -jnp.inf)
+    return row, jnp.where(update.present, jnp.where(is_positive, entries, -jnp.inf), 0.0)

@@ -268,8 +268,8 @@ def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int,
     residual = whitened_innovations(at_data, y)
     log_likelihood = jnp.where(jnp.isnan(at_data.log_likelihood), -jnp.inf, at_data.log_likelihood)
     return trace, smoothed.moments, {
-        "log_likelihood": log_likelihood, "leave_one_out": left_out,
-        "entry_leave_one_out": jnp.where(jnp.isnan(y), 0.0, entries), "whitened_innovation": residual, "change": change,
+        "log_likelihood": log_likelihood, "leave_one_out": left_out, "entry_leave_one_out": entries,
+        "whitened_innovation": residual, "change": change,
         "log_likelihood_change": at_data.log_likelihood.sum() - previous, "converged": jnp.asarray(True)}
 
 

@@ -293,11 +293,10 @@ class Switching(SeriesLikelihood):
         keys = split_by_name(key, ("path", "states", "noise"))
         trace = filter_regimes(regimes, y)
         path = sample_regimes(keys["path"], regimes, trace, y, 1)[0][:, 0]
-        entries = smooth_path(regimes, y, path).entry_leave_one_out[observed]
+        left_out = smooth_path(regimes, y, path).entry_leave_one_out
         states, times = sample_states(keys["states"], regimes, y, path)[observed], jnp.asarray(self.times, float)
         w = self._inputs_of_regimes(states, path[observed], times)
-        return {"leave_one_out": jnp.where(jnp.isnan(y), 0.0, entries),
-                "one_step_ahead": trace.log_likelihood[observed],
+        return {"leave_one_out": left_out[observed], "one_step_ahead": trace.log_likelihood[observed],
                 "residual": trace.residual[observed], "replicate": replicate(self.ssm, keys["noise"], w, times)}
 
     def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
