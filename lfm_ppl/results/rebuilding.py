@@ -210,11 +210,15 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
     return LikelihoodProblem(bound, parameter_draws(bound, posterior))
 
 
+def further_parameters(numpyro_model: Callable) -> dict[str, inspect.Parameter]:
+    """Return the parameters of a model after times and y, by name."""
+    return dict(list(inspect.signature(numpyro_model).parameters.items())[2:])
+
+
 def _missing_keywords(numpyro_model: Callable, arguments: Mapping[str, Any]) -> list[str]:
     """Return the names of keyword arguments that the model has no value of."""
-    parameters = list(inspect.signature(numpyro_model).parameters.values())[2:]
-    return [parameter.name for parameter in parameters if parameter.name not in arguments
-            and parameter.kind is not parameter.VAR_KEYWORD
+    return [name for name, parameter in further_parameters(numpyro_model).items()
+            if name not in arguments and parameter.kind is not parameter.VAR_KEYWORD
             and (parameter.default is None or parameter.default is parameter.empty)]
 
 

@@ -206,7 +206,7 @@ def _arguments(numpyro_model: Callable) -> dict[str, inspect.Parameter]:
     """Return the parameters of a model after times and y, by name."""
     while hasattr(numpyro_model, "fn"):  # an effect handler
         numpyro_model = numpyro_model.fn
-    return dict(list(inspect.signature(numpyro_model).parameters.items())[2:])
+    return rebuilding.further_parameters(numpyro_model)
 
 
 def _continued_rows(later: Mapping[str, Any], model_kwargs: Mapping[str, Any], result: Result,
@@ -255,17 +255,17 @@ def _forecast_selected(result: Result, numpyro_model: Callable, times: Times, in
     if is_selected_series(result):
         panel, label = panel_of(result)
         later = _inputs_by_name(result, inputs, numpyro_model, known_inputs.clock_of(result))
-        ahead = select_series(forecast(panel, numpyro_model, times, inputs=of_all_series(result, later), **options),
+        predicted = select_series(forecast(panel, numpyro_model, times, inputs=of_all_series(result, later), **options),
                               label)
     else:
         result_of_all, name = all_sites_of(result)
         options = {**options, "events": {name: options["events"]}}
-        ahead = select_site(
+        predicted = select_site(
             forecast(result_of_all, numpyro_model, {name: times}, inputs={name: inputs}, **options), name)
     groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)
               if name not in (GROUP, HELD_OUT, known_inputs.FORECAST)}
-    groups |= {name: arviz_data.group(ahead, name) for name in (GROUP, known_inputs.FORECAST)
-               if arviz_data.has_group(ahead, name)}
+    groups |= {name: arviz_data.group(predicted, name) for name in (GROUP, known_inputs.FORECAST)
+               if arviz_data.has_group(predicted, name)}
     return arviz_data.build(groups, arviz_data.attributes(result))
 
 
