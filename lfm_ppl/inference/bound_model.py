@@ -40,6 +40,9 @@ _FORWARD_MODE_LIMIT = 3
 _SITEWISE_STRATEGIES = (init_to_median, init_to_sample)
 """Initialisation strategies that depend on a site alone, so that they can be compiled."""
 
+_PROBE_DISTANCE = 0.1
+"""Distance of the second probe from the prior medians, in each unconstrained coordinate."""
+
 _ATTEMPTS = 20
 """Points that are drawn in the search for one of finite density."""
 
@@ -86,16 +89,19 @@ class BoundModel:
         self.model_data: Any = problem.observations
         self._selected = selected
         self._trace: dict[str, Any] | None = None
+        self._kind = problem.kind
+        # Shared with the same model of other data or another selected site.
         self._modifications: dict[Hashable, BoundModel] = {}
+        self._layouts: dict[Hashable, Partition] = {}
 
     @classmethod
     def of(cls, model: Callable, arguments: tuple, keywords: Mapping[str, Any], caller: str,
-           programs: Programs | None = None) -> BoundModel:
+           programs: Programs | None = None, selected: str | None = None) -> BoundModel:
         """Bind a NumPyro model to its arguments, the last of which is its data; see `trace_model`."""
         programs = programs or Programs()
         traced, constants, problem = trace_model(model, arguments, keywords, caller, programs)
         # Programs of constants serve no other data set, and end with the bound model.
-        return cls(traced, constants, problem, programs if problem.has_traced_inputs else Programs())
+        return cls(traced, constants, problem, programs if problem.has_traced_inputs else Programs(), selected)
 
     @property
     def y(self) -> Any:
@@ -121,11 +127,13 @@ class BoundModel:
         """
         if not self.is_by_site or self._selected is not None:
             return {self.site.name: self}
-        models = {name: BoundModel(self.traced, self.constants, self.problem, self.programs, name)
-                  for name in self.constants.call()[0][0]}
-        for model in models.values():
-            model._modifications = self._modifications
-        return models
+        return {name: self._copy(self.constants, self.problem, name) for name in self.constants.call()[0][0]}
+
+    def _copy(self, constants: Problem, problem: Problem, selected: str | None) -> BoundModel:
+        """Return the same model with other data or another selected site."""
+        bound = BoundModel(self.traced, constants, problem, self.programs, selected)
+        bound._modifications, bound._layouts = self._modifications, self._layouts
+        return bound
 
     @property
     def times(self) -> Any:
@@ -169,16 +177,12 @@ class BoundModel:
         if self.problem.data is not None:
             return self._with_checked_data(y)
         arguments, keywords = self.constants.call()
-        bound = BoundModel.of(self.model, (*arguments[:-1], y), keywords, self.traced.caller, self.programs)
-        bound._selected = self._selected
-        return bound
+        return BoundModel.of(self.model, (*arguments[:-1], y), keywords, self.traced.caller, self.programs,
+                             self._selected)
 
     def _with_checked_data(self, y: Any) -> BoundModel:
         """Return the same model with other data that are an argument of its programs."""
-        bound = BoundModel(self.traced, self.constants.with_data(y), self.problem.with_data(y), self.programs,
-                           self._selected)
-        bound._modifications = self._modifications
-        return bound
+        return self._copy(self.constants.with_data(y), self.problem.with_data(y), self._selected)
 
     def data(self, y: ArrayLike | Mapping[str, Any] | Problem | None = None) -> Any:
         """Return the data: ``y`` after checking it, or the bound data; where a site is selected, the part of the site.
@@ -374,6 +378,11 @@ class BoundModel:
             lambda key, problem: traced.draw(key, problem, strategy)))
         return np.asarray(run(key, problem), float)
 
+    def probes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return two points z (d,), the prior medians and one beside them; what is equal at both is taken as equal."""
+        medians = self.draw(jax.random.key(0))
+        return medians, medians + _PROBE_DISTANCE
+
     def start(self, key: jax.Array, strategy: Callable = init_to_median, attempts: int = _ATTEMPTS,
               evaluate: Callable[[np.ndarray], Any] | None = None) -> np.ndarray:
         """Return a point z (d,) by a NumPyro strategy at which all values of ``evaluate`` are finite.
@@ -502,7 +511,12 @@ class BoundModel:
         """Return requested times (K,) as an argument of a program: their layout where grids are arguments, too."""
         if times is None or not self.problem.has_traced_inputs:
             return Partition.of_constants(times)
-        return Partition.of_layout(self.traced.lay_out(self.site.name, self.constants, times))
+        # The layout runs the model.
+        key = self.site.name, times.tobytes()
+        if key not in self._layouts:
+            with jax.ensure_compile_time_eval():  # the call may come from compiled code
+                self._layouts[key] = Partition.of_layout(self.traced.lay_out(self.site.name, self.constants, times))
+        return self._layouts[key]
 
     def _warn_of_long_steps(self, log_likelihood: Any, z: Any, y: Any, requested_times: Any = None) -> None:
         """Warn where a step is too long for a fast decay; nothing happens in compiled code."""
@@ -554,8 +568,8 @@ class BoundModel:
         if (modified := self._modifications.get(key)) is not None:
             return modified if modified.model_data is self.model_data else modified._with_checked_data(self.model_data)
         programs = Programs() if name[1] is None else self.programs.of_modified(key)
-        modified = BoundModel.of(modify(self.model), *self.constants.call(), self.traced.caller, programs)
-        modified._selected = self._selected
+        modified = BoundModel.of(modify(self.model), *self.constants.call(), self.traced.caller, programs,
+                                 self._selected)
         if name[1] is not None and modified.problem.data is not None and not checks.traced(self.problem):
             self._modifications[key] = modified
         return modified
@@ -568,8 +582,7 @@ class BoundModel:
             make: returns the function, which takes a problem as an argument.
             problem: that problem; None: `problem`.
         """
-        leaves, structure = jax.tree.flatten(self.problem if problem is None else problem)
-        key = self._selected, name, structure, *((np.shape(leaf), str(leaf.dtype)) for leaf in leaves)
+        key = self._selected, name, self._kind if problem is None or problem is self.problem else problem.kind
         if key not in self.programs.by_name:
             self.programs.by_name[key] = make()
         return self.programs.by_name[key]

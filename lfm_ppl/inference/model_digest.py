@@ -25,22 +25,18 @@ from lfm_ppl.utils.programs import Program
 _TIMES = 16
 """Number of times at which the functions of a model are evaluated."""
 
-_SHIFT = 0.1
-"""Distance of the second point from the prior's medians, in each unconstrained coordinate."""
-
 
 def model_digest(bound: BoundModel) -> str:
     """Return a digest of the values of prior, dynamics and observation, and of the settings of the likelihood.
 
     They are evaluated at the prior's medians and at one other point, at 16 times and one state, without the filter.
     """
-    medians = jnp.asarray(bound.draw(jax.random.key(0)))
     times = np.unique(np.concatenate([np.ravel(part) for part in jax.tree.leaves(bound.times)]))
     selection = np.unique(np.linspace(0, len(times) - 1, _TIMES).round().astype(int))
     evaluate, recorder = bound.program("digest", lambda: _digest_program(bound))
     digest = hashlib.sha256(repr((bound.names, bound.size)).encode())
-    for z in (medians, medians + _SHIFT):
-        for leaf in jax.tree.leaves(evaluate(z, jnp.asarray(times[selection]), bound.problem)):
+    for z in bound.probes():
+        for leaf in jax.tree.leaves(evaluate(jnp.asarray(z), jnp.asarray(times[selection]), bound.problem)):
             is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
             array = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
             digest.update(f"{array.shape}{array.dtype}".encode() + _rounded(array))

@@ -115,11 +115,14 @@ class Problem(eqx.Module):
         return Problem(self.data, Partition.of(self.inputs.value[0], dict(grids)))
 
     def with_data(self, data: Any) -> Problem:
-        """Return the problem with other data; where they are constants, the programs are others, too."""
-        if self.data is not None:
-            return Problem(data, self.inputs)
-        (arguments, keywords), grids = self.inputs.value
-        return Problem(None, Partition.of_constants((((*arguments[:-1], data), keywords), grids)))
+        """Return the problem with other data, which must be an argument of its programs."""
+        return Problem(data, self.inputs)
+
+    @property
+    def kind(self) -> Hashable:
+        """The structure, with shapes and types of the leaves: problems of one kind have the same programs."""
+        leaves, structure = jax.tree.flatten(self)
+        return structure, *((np.shape(leaf), str(leaf.dtype)) for leaf in leaves)
 
     @property
     def has_traced_inputs(self) -> bool:

@@ -320,8 +320,7 @@ def _with_traced_inputs(traced: TracedModel, problem: Problem, times: Mapping[st
     tabulated = problem.with_traced_inputs({
         name: site_times._replace(layout=site_times.layout.padded()) for name, site_times in times.items()
         if site_times.layout is not None})
-    leaves, tree = jax.tree.flatten(tabulated)
-    key = tree, *structures, *((leaf.shape, str(leaf.dtype)) for leaf in leaves)
+    key = tabulated.kind, *structures
     if key not in programs.is_traceable:
         try:
             programs.is_traceable[key] = traced.structures(tabulated) == structures
