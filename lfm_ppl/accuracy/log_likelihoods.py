@@ -24,7 +24,7 @@ from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.draw_batches import BatchStore, map_draws
+from lfm_ppl.inference.draw_batches import BatchStore, DrawFunction, map_draws
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -155,7 +155,7 @@ def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods", **settin
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
         return {"total": bound.likelihood(values, y).log_prob(bound.data(y)).sum()}
 
-    return map_draws(bound, "log likelihoods", per_draw, problem.draws, jax.random.key(0),
+    return map_draws(bound, DrawFunction("log likelihoods", per_draw), problem.draws, jax.random.key(0),
                      rows=bound.times.size, store=problem.batch_store(name))["total"]
 
 
@@ -171,7 +171,7 @@ def recorded(problem: LikelihoodProblem, log_likelihoods: np.ndarray) -> np.ndar
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
         return bound.likelihood(values, y).log_prob_per_observation(bound.data(y)).sum()
 
-    return map_draws(bound, "one step ahead", per_draw, problem.draws, jax.random.key(0),
+    return map_draws(bound, DrawFunction("one step ahead", per_draw), problem.draws, jax.random.key(0),
                      rows=bound.times.size, store=problem.batch_store("one-step-ahead terms"))
 
 
@@ -316,7 +316,7 @@ def _particle_estimates(problem: LikelihoodProblem, particles: int, settings: Re
 def _map_sequentially(problem: LikelihoodProblem, key: jax.Array, name: tuple[str, *tuple[Hashable, ...]],
                       per_draw: Callable, show_progress: bool) -> np.ndarray:
     """Map over draws, one after another, with a display of the progress."""
-    return map_draws(problem.bound, name, per_draw, problem.draws, key, arguments=(problem.bound.constants,),
+    return map_draws(problem.bound, DrawFunction(name, per_draw, (problem.bound.constants,)), problem.draws, key,
                      report=Console() if show_progress else None, store=problem.batch_store(name[0]))
 
 

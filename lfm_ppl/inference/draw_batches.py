@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 import jax
@@ -50,20 +51,32 @@ class BatchStore(Protocol):
         """Write all stored batches."""
 
 
-def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable, draws: Mapping[str, Any], key: jax.Array, *,
-              arguments: Sequence[Any] = (), rows: int | None = None, report: Reporter | None = None,
-              store: BatchStore | None = None) -> Any:
-    """Return ``per_draw(values, key, *arguments)`` for all draws (S, ...).
+@dataclass(frozen=True)
+class DrawFunction:
+    """A function of a draw of the parameters, compiled once for all draws.
+
+    Attributes:
+        name: name of the computation, or a tuple of it and all that ``function`` depends on besides the model and its
+            arguments: the key of the compiled function.
+        function: maps site values, a random key and the arguments to a pytree of arrays.
+        arguments: pytrees, of which the first is a `Problem`, ``bound.problem`` or ``bound.constants``; empty: the
+            former alone.
+    """
+
+    name: str | tuple
+    function: Callable
+    arguments: Sequence[Any] = ()
+
+
+def map_draws(bound: BoundModel, per_draw: DrawFunction, draws: Mapping[str, Any], key: jax.Array, *,
+              rows: int | None = None, report: Reporter | None = None, store: BatchStore | None = None) -> Any:
+    """Return ``function(values, key, *arguments)`` of a `DrawFunction` for all draws (S, ...).
 
     Args:
         bound: the model and its data y.
-        name: name of the computation, or a tuple of it and all that ``per_draw`` depends on besides the model: the key
-            of the compiled function.
-        per_draw: maps site values, a random key and the arguments to a pytree of arrays.
+        per_draw: the function.
         draws: site name -> (S, ...).
         key: a JAX random key.
-        arguments: pytrees, of which the first is a `Problem`, ``bound.problem`` or ``bound.constants``; empty: the
-            former alone.
         rows: rows of the scan over time, which decide the size of a batch; None: one draw after another.
         report: target of the progress.
         store: stores the batches.
@@ -76,12 +89,12 @@ def map_draws(bound: BoundModel, name: str | tuple, per_draw: Callable, draws: M
     batch, parallel = _batch_size(count, rows, example.ssm.state_dim, is_vectorized)
 
     def sequential(draws: Any, keys: jax.Array, *arguments: Any) -> Any:
-        return jax.lax.map(lambda pair: per_draw(*pair, *arguments), (draws, keys))
+        return jax.lax.map(lambda pair: per_draw.function(*pair, *arguments), (draws, keys))
 
     def by_fours(draws: Any, keys: jax.Array, *arguments: Any) -> Any:
-        return mapped(lambda draw, key: per_draw(draw, key, *arguments), draws, keys, batch_size=BATCH_SIZE)
+        return mapped(lambda draw, key: per_draw.function(draw, key, *arguments), draws, keys, batch_size=BATCH_SIZE)
 
-    arguments = arguments or (bound.problem,)
+    name, arguments = per_draw.name, per_draw.arguments or (bound.problem,)
     run = bound.program(("map draws", is_vectorized, name), lambda: Program(by_fours if is_vectorized else sequential),
                         arguments[0])
     keys = split_keys(key, count)

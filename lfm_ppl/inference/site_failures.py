@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.draw_batches import map_draws
+from lfm_ppl.inference.draw_batches import DrawFunction, map_draws
 from lfm_ppl.likelihoods.constrained_likelihood import ConstrainedLikelihood
 
 POINTS = 100
@@ -86,7 +86,7 @@ def failures_at(bound: BoundModel, values: Mapping[str, Any]) -> SiteFailures | 
         return np.all(np.asarray(flags).reshape(len(flags), -1), axis=1)
 
     converged, possible = map(in_all_series, map_draws(
-        bound, "convergence of the sites", per_draw, _evenly_spaced(values, POINTS), jax.random.key(0),
+        bound, DrawFunction("convergence of the sites", per_draw), _evenly_spaced(values, POINTS), jax.random.key(0),
         rows=bound.times.size))
     return SiteFailures(len(converged), int((~converged).sum()), int((~possible).sum()))
 
@@ -104,7 +104,7 @@ def path_ess(bound: BoundModel, values: Mapping[str, Any]) -> PathESS | None:
         distribution = cast(ConstrainedLikelihood, bound.likelihood(values, y))
         return distribution.truncated_posterior().effective_sample_size(bound.data(y), distribution.draws)
 
-    sizes = map_draws(bound, "weights of trajectories", per_draw, _evenly_spaced(values, _WEIGHT_DRAWS),
+    sizes = map_draws(bound, DrawFunction("weights of trajectories", per_draw), _evenly_spaced(values, _WEIGHT_DRAWS),
                       jax.random.key(0), rows=bound.times.size)
     return PathESS(example.draws, float(np.median(sizes)), float(sizes.min()))
 

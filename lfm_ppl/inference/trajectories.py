@@ -21,7 +21,7 @@ from lfm_ppl.filtering.grid_layout import GridLayout, padded_size
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.draw_batches import BatchStore, map_draws
+from lfm_ppl.inference.draw_batches import BatchStore, DrawFunction, map_draws
 from lfm_ppl.inference.path_plan import PathPlan, first_simulated_times, has_forecast, plan_paths
 from lfm_ppl.inference.problem import Partition, Problem, signature
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
@@ -42,9 +42,6 @@ _FILTERS = 4
 
 _POINTS = 8
 """Points of the distribution of state and forces, for the bands of non-linear functions of them."""
-
-_SHIFT = 0.1
-"""Distance of the second point at which the noise of the rows is compared, in each unconstrained coordinate."""
 
 _PRODUCT = "largest product of step and rate"
 """Name of this number among the results of simulated paths."""
@@ -88,8 +85,8 @@ def scores(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], particle
 
     rows = bound.times.size * (1 if particles is None else particles.particles)
     problem = bound.problem if particles is None else bound.constants  # a particle filter needs the values of the times
-    return map_draws(bound, ("scores", particles, particle_steps), per_draw, draws, key, rows=rows,
-                     arguments=(problem,), report=report, store=store)
+    return map_draws(bound, DrawFunction(("scores", particles, particle_steps), per_draw, (problem,)), draws, key,
+                     rows=rows, report=report, store=store)
 
 
 def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
@@ -247,13 +244,13 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
         # Where the path is simulated the smoother stays at the last row of the data, at no cost.
         reached = plan.times if plan.times is None or not is_forecast else np.minimum(plan.times, bound.times.max())
         name = (*name, len(plan.requested), plan.rows, requested_times is None, plan.steps if is_forecast else None)
-        paths = map_draws(bound, name, shared_per_draw, draws, key, rows=plan.rows,
-                          arguments=(bound.problem, plan.times, bound.requested(reached)), **options)
+        arguments = bound.problem, plan.times, bound.requested(reached)
+        paths = map_draws(bound, DrawFunction(name, shared_per_draw, arguments), draws, key, rows=plan.rows, **options)
         return {name: value if name in ("log_likelihood", _PRODUCT) else value[..., :count, :]
                 for name, value in paths.items()}
     rows = plan.rows * (1 if particles is None else particles.particles)
-    return map_draws(bound, (*name, signature(requested_times), signature(vars(plan))), per_draw, draws, key, rows=rows,
-                     arguments=(bound.constants,), **options)
+    name = *name, signature(requested_times), signature(vars(plan))
+    return map_draws(bound, DrawFunction(name, per_draw, (bound.constants,)), draws, key, rows=rows, **options)
 
 
 def _of_family(ssm: StateSpaceModel, key: jax.Array, w: jax.Array, when: jax.Array,
@@ -357,8 +354,8 @@ def has_noise_of_rows(bound: BoundModel) -> bool:
     if not is_of_series:
         return noise_of_rows(example)
     # Rows that are equal at one point of the parameters may differ at another.
-    another = bound.likelihood(jnp.asarray(bound.draw(jax.random.key(0))) + _SHIFT)
-    return any(map(noise_of_rows, [*bound.site.members, *another.members]))
+    _, another = bound.probes()
+    return any(map(noise_of_rows, [*bound.site.members, *bound.likelihood(another).members]))
 
 
 def _particle_path(distribution: SeriesLikelihood, y: jax.Array, requested_times: Any, key: jax.Array,

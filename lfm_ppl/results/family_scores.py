@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.draw_batches import map_draws
+from lfm_ppl.inference.draw_batches import DrawFunction, map_draws
 from lfm_ppl.likelihoods.panel import Panel
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -61,7 +61,7 @@ def log_densities(bound: BoundModel, draws: Mapping[str, Any], predicted: xr.Dat
             times = jnp.broadcast_to(times, (y.shape[0], times.shape[-1]))
         return distribution.mapped(series_log_prob, w, y, times)
 
-    log_densities = map_draws(bound, ("log densities", y.shape), per_draw,
+    log_densities = map_draws(bound, DrawFunction(("log densities", y.shape), per_draw),
                       {**draws, _PATH: w, _VALUES: np.broadcast_to(y, (count, *y.shape)),
                        _TIMES: np.broadcast_to(times, (count, *times.shape))}, jax.random.key(0))
     return np.where(np.isfinite(y), log_densities, np.nan)
