@@ -36,6 +36,7 @@ from .io.data_set import Data as Data
 from .latent_grid.laplace import laplace as laplace
 from .latent_grid.latent_grid import LatentGrid as LatentGrid
 from .likelihoods.constrained_likelihood import ConstrainedLikelihood as ConstrainedLikelihood
+from .likelihoods.handlers.approximate import approximate as approximate
 from .likelihoods.handlers.fixing import fix as fix
 from .likelihoods.handlers.on_latent_grid import on_latent_grid as on_latent_grid
 from .likelihoods.marginal_likelihood import MarginalLikelihood as MarginalLikelihood

@@ -15,7 +15,7 @@ COSTLY = {
     "constrained.moving_horizon", "constrained.posterior", "constrained.full_information", "inference.bind",
     "workflows.fit", "workflows.fit_many",
     "workflows.backtest", "workflows.to_arviz", "workflows.forecast", "fokker_planck_grid.fokker_planck",
-    "inference.bound_model", "likelihoods.handlers.on_latent_grid", "likelihoods.handlers.settings",
+    "inference.bound_model", "likelihoods.handlers.on_latent_grid", "likelihoods.handlers.approximate",
     "inference.kernels.elliptical_slice", "inference.kernels.particle_marginal", "latent_grid.laplace",
     "latent_grid.latent_grid", "orbits.deviations", "accuracy.check_accuracy", "accuracy.calibration",
     "switching.rao_blackwellised", "switching.switched_simulation"}

@@ -62,7 +62,7 @@ def more_iterations(example: SeriesLikelihood) -> Refinement | None:
     """Return more iterations of posterior linearisation; None where the likelihood takes none."""
     if example.has_sites or example.ssm.plan.is_linear or not example.has_gaussian_state:
         return None
-    current = example.iterations
+    current = example.settings.iterations
     count = DEFAULT_ITERATIONS if current < DEFAULT_ITERATIONS else max(_MANY_ITERATIONS, 2 * current)
     return Refinement({"iterations": count}, f"{count} iterations of posterior linearisation instead of {current}",
                       f"iterations={count} (--iterations {count})")
@@ -89,7 +89,7 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
     """
     example = bound.site.example
     # With a tolerance there are no iterations.
-    candidates = (more_iterations(example) if example.tolerance is None else None, shorter_steps(example))
+    candidates = (more_iterations(example) if example.settings.tolerance is None else None, shorter_steps(example))
     refinements = [refinement for refinement in candidates if refinement is not None]
     if not refinements:
         return []

@@ -201,8 +201,8 @@ def _assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: 
         step_change_sd=float(change.std()), noise_sd=noise_sd, noise_share=_share(noise_sd, ratio),
         particles=reference.particles, checked=ratio.size,
         available=posterior.sizes["chain"] * posterior.sizes["draw"], impossible=int(np.isneginf(ratio).sum()),
-        sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.steps, max_step=example.max_step,
-        tolerance=example.tolerance)
+        sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.settings.steps,
+        max_step=example.settings.max_step, tolerance=example.settings.tolerance)
     if iterated is not None and (refinement := more_iterations(example)) is not None:
         findings = replace(findings, iterations=refinement.settings["iterations"], ratio_sd=finite_sd(ratio),
                            iterated_ratio_sd=finite_sd(averaged.log_mean - iterated))
@@ -221,7 +221,8 @@ def _assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: 
         "ess": efficiency * weights.ess,
         "particles": reference.particles, "particles_limited": int(reference.limited), "noise_sd": noise_sd,
         "noise_share": findings.noise_share, "step_change_mean": float(change.mean()),
-        "step_change_sd": findings.step_change_sd, "steps": example.steps, "available_draws": findings.available,
+        "step_change_sd": findings.step_change_sd, "steps": example.settings.steps,
+        "available_draws": findings.available,
         "verdict": verdict.word, "reason": verdict.reason, "command": verdict.command,
         "remedies": json.dumps(verdict.remedies)}))
 

@@ -182,11 +182,11 @@ def finer_tolerance(tolerance: float) -> float:
 
 def finer_steps(example: SeriesLikelihood) -> dict[str, Any]:
     """Return the settings of a likelihood with about twice as many integration steps."""
-    settings: dict[str, Any] = {"steps": 2 * example.steps}
-    if example.max_step is not None:
-        settings["max_step"] = example.max_step / 2
-    if example.tolerance is not None:
-        settings["tolerance"] = finer_tolerance(example.tolerance)
+    settings: dict[str, Any] = {"steps": 2 * example.settings.steps}
+    if example.settings.max_step is not None:
+        settings["max_step"] = example.settings.max_step / 2
+    if example.settings.tolerance is not None:
+        settings["tolerance"] = finer_tolerance(example.settings.tolerance)
     return settings
 
 
@@ -200,8 +200,8 @@ def on_grid(problem: LikelihoodProblem, settings: ReferenceSettings) -> Referenc
     bound, steps = problem.bound, settings.steps
 
     def series_log_likelihood(distribution: SeriesLikelihood, y: jax.Array) -> jax.Array:
-        time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps,
-                                    distribution.max_step)
+        time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.settings.steps,
+                                    distribution.settings.max_step)
         return fokker_planck.log_likelihood(distribution.ssm, time_grid, y, layout)
 
     def per_draw(values: Any, key: jax.Array, y: jax.Array) -> jax.Array:
@@ -243,7 +243,8 @@ def by_particles(problem: LikelihoodProblem, settings: ReferenceSettings, noise:
         pilot = problem.select(rows).rename_stores(prefix="pilot ")
         sd = noise(_particle_estimates(pilot, count, settings, pilot_key))
         needed_particles = count * (sd / target) ** 2 * _SAFETY if np.isfinite(sd) else np.inf
-        time_grid = build_time_grid(example.ssm, example.times, settings.steps or example.steps, example.max_step)
+        time_grid = build_time_grid(example.ssm, example.times, settings.steps or example.settings.steps,
+                                    example.settings.max_step)
         steps_made = np.shape(time_grid.intervals.length)[0] * time_grid.steps
         each_particle = problem.size * replicates * problem.series * steps_made * example.ssm.state_dim
         most = max(count, most_work / each_particle)
@@ -288,11 +289,11 @@ def _particle_estimates(problem: LikelihoodProblem, particles: int, settings: Re
     filter_settings = particle_filter.check_settings(example.ssm, ParticleSettings(particles))
 
     def series_log_likelihood(distribution: SeriesLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
-        time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.steps,
-                                    distribution.max_step)
+        time_grid = build_time_grid(distribution.ssm, distribution.times, steps or distribution.settings.steps,
+                                    distribution.settings.max_step)
         if takes_smoother_draws(distribution.ssm):
-            filtering = filter_problem(distribution.ssm, distribution.rule, time_grid)
-            return importance.log_likelihood(filtering, y, key, particles, as_settings(distribution.sites))
+            filtering = filter_problem(distribution.ssm, distribution.settings.rule, time_grid)
+            return importance.log_likelihood(filtering, y, key, particles, as_settings(distribution.settings.sites))
         return particle_filter.log_likelihood(distribution.ssm, time_grid, y, key, filter_settings)
 
     bound, series = problem.bound, problem.series

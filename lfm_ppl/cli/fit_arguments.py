@@ -10,7 +10,7 @@ from lfm_ppl.cli import choices, pages
 from lfm_ppl.cli.options import Approximation, FitArguments
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
-from lfm_ppl.likelihoods.handlers.settings import approximate
+from lfm_ppl.likelihoods.handlers.approximate import approximate
 
 TIME_UNIT = "file_time_unit"
 """Attribute of a result: the unit that --time-unit gave to the times of the data file."""

@@ -91,7 +91,9 @@ def _print_sites(model: loading.ModelFile, bound: Any) -> None:
     ):
         if rows or title in ("forces", "states"):
             _print_table(title, rows)
-    parts = [f"{example.rule.name}, {example.steps} steps", example.iterations and f"{example.iterations} iterations"]
+    settings = example.settings
+    parts = [f"{settings.rule.name}, {settings.steps} steps",
+             settings.iterations and f"{settings.iterations} iterations"]
     text = ", ".join(filter(None, parts)) + (f"; sites by {example.sites_in_words}" if example.sites_in_words else "")
     if is_exact(example.ssm) or not example.has_gaussian_state:
         is_exact_likelihood = example.has_gaussian_state and example.ssm.plan.has_exact_moments

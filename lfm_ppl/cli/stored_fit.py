@@ -31,7 +31,7 @@ class StoredFit:
 
 def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit:
     """Rebuild the model from what the result in a file remembers of it."""
-    from lfm_ppl.likelihoods.handlers.settings import approximate
+    from lfm_ppl.likelihoods.handlers.approximate import approximate
     from lfm_ppl.results import arviz_data, rebuilding
     from lfm_ppl.results.inputs import ORIGIN, inputs_of
     from lfm_ppl.results.scalars import unit_of

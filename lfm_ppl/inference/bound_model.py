@@ -25,8 +25,8 @@ from lfm_ppl.filtering.stiffness import ExplicitSteps, long_step_message, warn_o
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.problem import Partition, Problem, signature
 from lfm_ppl.inference.trace import Programs, TracedModel, trace_model
+from lfm_ppl.likelihoods.handlers.approximate import approximate
 from lfm_ppl.likelihoods.handlers.fixing import fix
-from lfm_ppl.likelihoods.handlers.settings import approximate
 from lfm_ppl.likelihoods.likelihood import Likelihood
 from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood, single_site
 from lfm_ppl.likelihoods.panel import Panel
@@ -537,8 +537,8 @@ class BoundModel:
         if not example.has_explicit_steps:
             return None
         explicit = self.explicit_steps(z, y, requested_times)
-        return long_step_message(explicit, example.ssm.model.state_names, example.steps,
-                                 has_method and "method" in example.settings, example.regime_names)
+        return long_step_message(explicit, example.ssm.model.state_names, example.settings.steps,
+                                 has_method and "method" in example.accepted, example.regime_names)
 
     def _check_single(self, name: str) -> None:
         if isinstance(self.site.distribution, Panel):

@@ -97,9 +97,10 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         # Not the leaves of the distribution itself: NumPyro orders its fields by their hashes.
         names = sorted(set(type(likelihood).gather_pytree_data_fields()) - {"model", "models"})
         fields = [getattr(likelihood, name) for name in names]
-        self.values += [*_arrays((fields, distribution.rule)), *(self._values(ssm) for ssm in distribution.ssms)]
+        self.values += [*_arrays((fields, distribution.settings.rule)),
+                        *(self._values(ssm) for ssm in distribution.ssms)]
         self.settings += repr((
-            site["name"], distribution.rule, distribution.steps, model.state_names, model.output_names,
+            site["name"], distribution.settings, model.state_names, model.output_names,
             model.force_names, model.units, model.nonlinear_inputs, model.observation.angular,
             *([model.observation.period] if model.observation.angular else []),
             model.deterministic_names, ssm.stack.jump_times,
@@ -109,10 +110,7 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
             self.values.append(jax.vmap(lambda t: boxes(x, u, t))(self.times))
             self.settings += repr((boxes.constraints.labels, distribution.grid, distribution.draws))
         elif isinstance(distribution, Switching):
-            self.settings += repr((distribution.regime_names, distribution.max_step, distribution.merging))
-        else:
-            self.settings += repr((distribution.max_step, distribution.iterations, distribution.damping,
-                                   distribution.tolerance, distribution.method, distribution.sites))
+            self.settings += repr((distribution.regime_names, distribution.merging))
         return super().replacement(likelihood, site)
 
     def _values(self, ssm: StateSpaceModel) -> list[Any]:

@@ -83,7 +83,7 @@ def plan_paths(bound: BoundModel, requested_times: np.ndarray | None, simulated:
     # The first requested time pads the times between requested ones, of which series have different numbers.
     rows = [np.insert(times, count, np.repeat(times[0], length - len(times)))
             for times in (plan.times for plan in plans) if times is not None]
-    smoother_steps = [_steps_per_interval(series.ssm, times, row, series.steps)
+    smoother_steps = [_steps_per_interval(series.ssm, times, row, series.settings.steps)
                       for series, times, row in zip(members, bound.times, rows, strict=True)]
     return PathPlan(np.array(rows), plans[0].requested, np.arange(length - data, length),
                  max(plan.steps for plan in plans), max(smoother_steps))
@@ -93,10 +93,10 @@ def _plan_of(series: SeriesLikelihood, times: np.ndarray, requested_times: np.nd
              since: float) -> PathPlan:
     """Return the rows of a series, or of all series with common times; arguments as in `plan_paths`."""
     gaps = np.diff(times, axis=-1)
-    base = series.steps
-    if series.max_step is not None:
-        base = max(base, int(np.ceil(gaps.max(initial=0.0) / series.max_step * (1 - 1e-12))))
-    factor = SIMULATION_STEPS * (1 if series.tolerance is None else _ADAPTIVE_FACTOR)
+    base = series.settings.steps
+    if series.settings.max_step is not None:
+        base = max(base, int(np.ceil(gaps.max(initial=0.0) / series.settings.max_step * (1 - 1e-12))))
+    factor = SIMULATION_STEPS * (1 if series.settings.tolerance is None else _ADAPTIVE_FACTOR)
     fine = factor * base
     longest = _longest_step(series, times) / factor
     rows = np.arange(times.shape[-1])
@@ -158,10 +158,10 @@ def _steps_per_interval(ssm: StateSpaceModel, times: Any, requested_times: Any, 
 
 def _longest_step(series: SeriesLikelihood, times: np.ndarray) -> float:
     """Return the longest step of the fit of a series."""
-    if series.max_step is not None:
-        return series.max_step
+    if series.settings.max_step is not None:
+        return series.settings.max_step
     origin = series.model.initial_time
     first = np.atleast_2d(times)[0]
     start = first[0] if origin is None or checks.traced(origin) else float(origin)
-    longest = longest_step(series.ssm, first, start, series.steps)
+    longest = longest_step(series.ssm, first, start, series.settings.steps)
     return np.inf if longest is None else longest

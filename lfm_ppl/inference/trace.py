@@ -74,6 +74,12 @@ class SharedModel:
         functools.update_wrapper(self, model)
         self.fn, self.programs = model, Programs()  # ``fn`` as in NumPyro's handlers
 
+    def modified(self, name: Hashable, modify: Callable[[Callable], Callable]) -> SharedModel:
+        """Return the model that a function makes of this one; the name says everything of the function."""
+        model = SharedModel(modify(self.fn))
+        model.programs = self.programs.of_modified(name)
+        return model
+
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         """Run the model."""
         return self.fn(*arguments, **keywords)

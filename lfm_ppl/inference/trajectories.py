@@ -80,7 +80,7 @@ def scores(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], particle
         if particles is None:
             return series.scores(key, y)
         keys = split_by_name(key, ("scores", "path", "noise"))
-        w, times = _particle_path(series, y, None, keys["path"], particles, particle_steps or series.steps, 1)
+        w, times = _particle_path(series, y, None, keys["path"], particles, particle_steps or series.settings.steps, 1)
         return series.scores(keys["scores"], y) | {"replicate": replicate(series.ssm, keys["noise"], w, times)}
 
     rows = bound.times.size * (1 if particles is None else particles.particles)
@@ -198,7 +198,7 @@ def _paths(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requeste
         else:
             smoothed = None
             w, when = _particle_path(distribution, y, path_times, keys["path"], particles,
-                                     particle_steps or plan.smoother_steps or distribution.steps)
+                                     particle_steps or plan.smoother_steps or distribution.settings.steps)
         requested = plan.requested
         results["deterministic"] = jax.vmap(ssm.deterministics)(w[requested], when[requested])
         if isinstance(ssm.model.observation, ObservationFamily):
@@ -366,7 +366,7 @@ def _particle_path(distribution: SeriesLikelihood, y: jax.Array, requested_times
     proportion to its estimate of the likelihood, the error also decreases with the number of filters.
     """
     ssm, times = distribution.ssm, distribution.times
-    grid = build_time_grid(ssm, times, steps, distribution.max_step, requested_times)
+    grid = build_time_grid(ssm, times, steps, distribution.settings.max_step, requested_times)
     keys = split_by_name(key, ("filters", "choice"))
     states, _, total = jax.lax.map(lambda k: draw_trajectories(ssm, grid, y, k, particles, 1, TRACING),
                                    jax.random.split(keys["filters"], filters))

@@ -13,7 +13,7 @@ Source: Cunningham, Hennig and Lacoste-Julien (2011), Gaussian probabilities and
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +33,7 @@ from lfm_ppl.filtering.problem import at_intervals
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import Sites
+from lfm_ppl.likelihoods.filter_settings import FilterSettings
 from lfm_ppl.likelihoods.marginal_likelihood import CONSTRAINTS, MarginalLikelihood
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood, check_model, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
@@ -58,7 +59,7 @@ class ConstrainedLikelihood(SeriesLikelihood):
         model: the latent force model, with Gaussian observations.
         times: (T,), non-decreasing.
         rule: linearisation rule; `Cubature()` by default.
-        steps: integration steps between two rows of the grid or the data.
+        steps: integration steps between two rows of the grid or the data; 10 by default.
         lower: name of a state, force or output -> its lower bound.
         upper: the same for upper bounds.
         constraints: functions c(x, u, t), feasible where >= 0; with ``draws``, linear in x and u.
@@ -85,8 +86,9 @@ class ConstrainedLikelihood(SeriesLikelihood):
 
     pytree_data_fields = ("lower", "upper")
     pytree_aux_fields = ("constraints", "grid", "draws")
+    accepted: ClassVar[tuple[str, ...]] = ("rule", "steps")
 
-    def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None = None, steps: int = 10, *,
+    def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None = None, steps: int | None = None, *,
                  lower: Mapping[str, Any] | None = None, upper: Mapping[str, Any] | None = None,
                  constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), grid: Any = None,
                  draws: int = 256):
@@ -102,15 +104,18 @@ class ConstrainedLikelihood(SeriesLikelihood):
             checks.positive_integer("draws", draws)
             if draws % 2:
                 raise ValueError(f"draws must be even, half of them mirror the other half; got {draws}.")
-        super().__init__(model, times, rule, steps)
+        super().__init__(model, times, *FilterSettings.of({"rule": rule, "steps": steps}))
         if checks.concrete(times) is not None:
             check_linear(self.truncated_posterior(), draws)
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """Arguments besides model and times."""
-        return {name: getattr(self, name) for name in ("rule", "steps", "lower", "upper", "constraints", "grid",
-                                                       "draws")}
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor besides model and times, without settings that are left open."""
+        return super().arguments | {name: getattr(self, name) for name in CONSTRAINTS}
+
+    def with_settings(self, **settings: Any) -> SeriesLikelihood:
+        """Return the same distribution with other settings of its filter, such as ``steps``, or other constraints."""
+        return likelihood_with(self.model, self.times, self.arguments | settings)
 
     @property
     def has_gaussian_state(self) -> bool:
@@ -148,7 +153,8 @@ class ConstrainedLikelihood(SeriesLikelihood):
         if at is not None:
             rows = add_times(rows, np.asarray(at, float))
         ssm = stacked_model(self.model, boxes)
-        return TruncatedPosterior(ssm, self.rule, build_time_grid(ssm, rows.times, self.steps), rows, boxes,
+        grid = build_time_grid(ssm, rows.times, self.settings.steps)
+        return TruncatedPosterior(ssm, self.settings.rule, grid, rows, boxes,
                                   check_variances(self.model, np.shape(self.times)[0]), SiteSettings())
 
     def log_prob(self, value: Any) -> jax.Array:
@@ -215,11 +221,11 @@ def likelihood_with(model: LatentForceModel, times: Any, settings: Mapping[str, 
     constraints = {name: settings.pop(name) for name in CONSTRAINTS if name in settings}
     if not any(constraints.get(name) for name in ("lower", "upper", "constraints")):
         return MarginalLikelihood(model, times, **settings)
-    rule, steps = settings.pop("rule", None), settings.pop("steps", 10)
+    rule, steps = settings.pop("rule", None), settings.pop("steps", None)
     for name in ("max_step", "tolerance"):
         if settings.get(name) is not None:
             raise ValueError(f"{name} is not supported under constraints, which add rows to the grid; raise steps.")
-    if (method := settings.get("method", DEFAULT_METHOD)) != DEFAULT_METHOD:
+    if (method := settings.get("method") or DEFAULT_METHOD) != DEFAULT_METHOD:
         raise ValueError(f"method={method!r} is not supported under constraints; leave method out.")
     if settings.get("iterations"):
         raise ValueError("under constraints a non-linear model is always linearised about smoothed moments. Leave "

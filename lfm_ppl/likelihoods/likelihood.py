@@ -31,9 +31,14 @@ class Likelihood(dist.Distribution):
     def split_key(self, key: jax.Array) -> jax.Array:
         """Return a random key for each series, or the key itself for one series."""
 
+    @property
+    @abstractmethod
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor that are given besides model and times; what is left open is not in it."""
+
+    @abstractmethod
     def with_settings(self, **settings: Any) -> Any:
         """Return the same distribution with other settings of its filter, such as ``steps``."""
-        raise NotImplementedError
 
     @abstractmethod
     def checked(self, value: Any) -> jax.Array:

@@ -18,13 +18,12 @@ import jax
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from lfm_ppl.filtering.arguments import check_iterations
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.evidence import Evidence, evidence
 from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
-from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS
 from lfm_ppl.filtering.iterated import number_of_iterations
+from lfm_ppl.likelihoods.filter_settings import FilterSettings
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood, check_model, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -60,12 +59,12 @@ class MarginalLikelihood(SeriesLikelihood):
         model: the latent force model; it may hold traced parameters.
         times: (T,), non-decreasing.
         rule: linearisation rule; `Cubature()` by default.
-        steps: integration steps between two consecutive times.
+        steps: integration steps between two consecutive times; 10 by default.
         max_step: longest step, in units of time; longer intervals get more steps. None: twice the median step. A linear
             model without known inputs is exact, and needs no steps.
         iterations: of posterior linearisation; 0 for none. By default 3 for a model that is not linear, and 0 for a
             linear model, an observation family, or with a ``tolerance``.
-        damping: largest share of each new iterate that is taken; less where the iterates turn back.
+        damping: largest share of each new iterate that is taken, by default 0.7; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations. With it the length of the steps follows
             the moments, for every parameter anew, for posteriors over slow and fast models; up to five times ``steps``
             are tried. None: ``steps`` equal steps. Not with ``iterations``. A linear model has exact transitions, with
@@ -75,8 +74,9 @@ class MarginalLikelihood(SeriesLikelihood):
             converged sites. Where the model is not linear it is linearised about smoothed moments, ``iterations`` times
             (8 by default). Where sites do not converge, the log density of a model that is not linear is that of
             assumed density filtering, which is rougher, and -inf in a linear one.
-        method: of integration, "runge-kutta" (explicit), or "exponential" for stiff dynamics: its steps of order three
-            are stable however fast a state decays, and each costs some ten of the other. With a ``tolerance``, too.
+        method: of integration, "runge-kutta" (explicit, the default), or "exponential" for stiff dynamics: its steps of
+            order three are stable however fast a state decays, and each costs some ten of the other. With a
+            ``tolerance``, too.
 
     Raises:
         ValueError, TypeError: as `lfm_ppl.filter`; also where it is used in a ``numpyro.plate``. In compiled code a
@@ -98,58 +98,53 @@ class MarginalLikelihood(SeriesLikelihood):
     Source: Hartikainen et al. (2012), section 4; Singer (2011), AStA 95.
     """
 
-    pytree_aux_fields = ("max_step", "iterations", "damping", "tolerance", "method", "sites")
-
-    def __init__(self, model: LatentForceModel, times: ArrayLike, rule: Rule | None = None, steps: int = 10,
-                 max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
+    def __init__(self, model: LatentForceModel, times: ArrayLike, rule: Rule | None = None, steps: int | None = None,
+                 max_step: float | None = None, iterations: int | None = None, damping: float | None = None,
                  tolerance: float | None = None, sites: SiteSettings | str | None = None, *,
-                 method: str = DEFAULT_METHOD, validate_args: bool | None = None, **unknown: Any):
+                 method: str | None = None, validate_args: bool | None = None, **unknown: Any):
         for name in unknown:
             remedy = "; constraints are arguments of lfm.ConstrainedLikelihood" if name in CONSTRAINTS else ""
             raise TypeError(f"MarginalLikelihood has no argument {name!r}{remedy}.")
         check_model(model)
-        check_iterations(iterations, damping, tolerance)
-        if tolerance is not None:
-            checks.positive("tolerance", tolerance, "It is in standard deviations, 0.001 for example.")
-        checks.one_of("method", method, METHODS)
+        arguments = {"rule": rule, "steps": steps, "max_step": max_step, "iterations": iterations, "damping": damping,
+                     "tolerance": tolerance, "method": method, "sites": sites}
+        settings, given = FilterSettings.of(arguments)
         if sites is not None and not isinstance(model.observation, ObservationFamily):
             raise ValueError("sites are for an observation family such as lfm.PoissonObservation; the observation of "
                              "this model is Gaussian, whose filter needs none. Leave out sites.")
-        self.max_step, self.damping = max_step, damping
-        self.tolerance, self.method = None if tolerance is None else float(tolerance), method
-        self.sites = None if sites is None else as_settings(sites)
-        super().__init__(model, times, rule, steps)
-        self.iterations = number_of_iterations(iterations, self.ssm, self.tolerance)
+        super().__init__(model, times, settings, given)
+        self.settings = replace(settings, iterations=number_of_iterations(iterations, self.ssm, settings.tolerance))
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Arguments besides model and times."""
-        return {name: getattr(self, name) for name in ("rule", "steps", "max_step", "iterations", "damping",
-                                                       "tolerance", "method", "sites")}
+    def with_settings(self, **settings: Any) -> MarginalLikelihood:
+        """Return the same distribution with other settings of its filter, such as ``steps``."""
+        return MarginalLikelihood(self.model, self.times, **self.arguments | settings)
 
     @property
     def description(self) -> str:
         """How the likelihood is computed: exact or by which approximation."""
         if self.is_family:
             return f"approximate (sites by {self.sites_in_words})"
+        settings = self.settings
         if self.ssm.plan.is_linear:
             if self.ssm.plan.has_exact_moments:
                 return "exact (the model is linear)"
             if self.ssm.plan.has_exact_transition:
-                ignored = "" if self.tolerance is None else "; tolerance has no effect"
-                return f"exact transitions, known inputs integrated in {self.steps} steps between two times{ignored}"
-            return "linear model, integrated " + (f"in {self.steps} steps between two times" if self.tolerance is None
-                                                  else f"with tolerance {self.tolerance:g}")
-        if not self.iterations:
+                ignored = "" if settings.tolerance is None else "; tolerance has no effect"
+                return (f"exact transitions, known inputs integrated in {settings.steps} steps between two times"
+                        f"{ignored}")
+            return "linear model, integrated " + (
+                f"in {settings.steps} steps between two times" if settings.tolerance is None
+                else f"with tolerance {settings.tolerance:g}")
+        if not settings.iterations:
             return "approximate (a single pass of the filter)"
         count = {1: "one iteration", 2: "two iterations", 3: "three iterations"}.get(
-            self.iterations, f"{self.iterations} iterations")
+            settings.iterations, f"{settings.iterations} iterations")
         return f"approximate ({count} of posterior linearisation)"
 
     @property
     def site_settings(self) -> SiteSettings:
         """Settings of the sites of an observation family."""
-        return as_settings(self.sites, self.iterations)
+        return as_settings(self.settings.sites, self.settings.iterations)
 
     @property
     def sites_in_words(self) -> str:
@@ -173,7 +168,7 @@ class MarginalLikelihood(SeriesLikelihood):
         else:
             # The guard is around the sum: one failure makes it -inf, and the derivatives of all other terms zero.
             log_likelihood = self._guarded_terms(y, lambda terms: terms.sum(keepdims=True))[0]
-        warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood, self.site_settings,
+        warn_of_breakdown(self.ssm, self.settings.rule, self.time_grid, y, None, log_likelihood, self.site_settings,
                           has_converged)
         self.warn_of_long_steps(y, log_likelihood)
         return log_likelihood
@@ -207,11 +202,11 @@ class MarginalLikelihood(SeriesLikelihood):
     def simulate(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> tuple[jax.Array, jax.Array]:
         """Return physical states (*sample_shape, T, M) and observations (*sample_shape, T, D); see `sample`."""
         initial_time, times = self.time_grid.initial_time, checks.concrete(self.times)
-        steps, breakpoints = SIMULATION_STEPS * self.steps, input_breakpoints(self.model, times, initial_time)
+        steps, breakpoints = SIMULATION_STEPS * self.settings.steps, input_breakpoints(self.model, times, initial_time)
         program = SimulationProgram(self.ssm, steps, breakpoints, self.is_stiff)
         lengths = checks.concrete(self.time_grid.intervals.length)
         if times is not None and lengths is not None and not checks.traced(initial_time):
-            if self.tolerance is None:
+            if self.settings.tolerance is None:
                 longest = float(lengths.max(initial=0.0)) / self.time_grid.steps / SIMULATION_STEPS
                 program = replace(program, breakpoints=divide_steps(times, initial_time, steps, breakpoints, longest))
             program = program.resolved(times, float(initial_time))

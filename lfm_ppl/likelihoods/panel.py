@@ -17,9 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
-from lfm_ppl.filtering.arguments import as_rule
 from lfm_ppl.filtering.ep.settings import SiteSettings
-from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD
 from lfm_ppl.filtering.stiffness import long_step_message, warn_of_message
 from lfm_ppl.likelihoods.constrained_likelihood import likelihood_with
 from lfm_ppl.likelihoods.likelihood import Likelihood
@@ -40,10 +38,11 @@ class Panel(Likelihood):
 
     support = constraints.real_matrix
     pytree_data_fields = ("parameters", "times")
-    pytree_aux_fields = ("build", "settings")
+    pytree_aux_fields = ("build", "arguments")
+    arguments: dict[str, Any] = {}
 
     def __init__(self, build: Callable[..., LatentForceModel], parameters: Any, times: ArrayLike,
-                 settings: dict[str, Any]):
+                 arguments: dict[str, Any]):
         leaves = jax.tree_util.tree_leaves(parameters)
         if not leaves:
             raise ValueError("parameters must hold at least one array with a leading axis for the series.")
@@ -53,13 +52,14 @@ class Panel(Likelihood):
             raise ValueError("every array in parameters needs the same leading axis, one entry a series; got "
                              f"{shapes}. Repeat a shared parameter with jnp.broadcast_to, or close over it in build.")
         refuse_times_by_site(times)
-        self.build, self.parameters, self.times, self.settings = build, parameters, times, settings
+        self.build, self.parameters, self.times = build, parameters, times
+        self.arguments = {name: value for name, value in arguments.items() if value is not None}
         (count,) = sizes
         if self._has_series_times and np.shape(times)[0] != count:
             raise ValueError(f"times has {np.shape(times)[0]} rows for {count} series; give one row a series, or one "
                              "vector for all.")
         concrete_times = checks.concrete(times)
-        if self._has_series_times and settings.get("max_step") is not None:
+        if self._has_series_times and arguments.get("max_step") is not None:
             raise ValueError("max_step is not supported in a panel whose series have different times, because all "
                              "series share one number of rows. Raise steps, or give all series one vector of times.")
         for series, row in enumerate(concrete_times) if self._has_series_times and concrete_times is not None else ():
@@ -88,7 +88,7 @@ class Panel(Likelihood):
         return np.ndim(self.times) == 2
 
     def _likelihood(self, parameters: Any, times: Any) -> SeriesLikelihood:
-        return likelihood_with(self.build(parameters), times, self.settings)
+        return likelihood_with(self.build(parameters), times, self.arguments)
 
     def _check_events(self, count: int) -> None:
         """Raise ValueError if an event of a series lies before its initial time."""
@@ -128,6 +128,10 @@ class Panel(Likelihood):
         times = jnp.asarray(self.times, float)[index] if self._has_series_times else self.times
         return self._likelihood(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[index], self.parameters), times)
 
+    def with_settings(self, **settings: Any) -> Panel:
+        """Return the same distribution with other settings of the filter of each series, such as ``steps``."""
+        return Panel(self.build, self.parameters, self.times, self.arguments | settings)
+
     def with_times(self, times: ArrayLike) -> Panel:
         """Return the same distribution with concrete times instead of traced ones."""
         panel = copy.copy(self)
@@ -163,7 +167,7 @@ class Panel(Likelihood):
         if not np.isfinite(np.asarray(log_likelihood)).all():
             return
         explicit_steps = Program(lambda y: self.mapped(lambda series, y: series.explicit_steps(y), y))
-        warn_of_message(long_step_message(explicit_steps(y), first.model.state_names, first.steps))
+        warn_of_message(long_step_message(explicit_steps(y), first.model.state_names, first.settings.steps))
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate every series: (*sample_shape, B, T, D)."""
@@ -199,9 +203,9 @@ class Panel(Likelihood):
 
 
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayLike, rule: Rule | None = None,
-          steps: int = 10, max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
-          tolerance: float | None = None, sites: SiteSettings | str | None = None,
-          method: str = DEFAULT_METHOD) -> Panel:
+          steps: int | None = None, max_step: float | None = None, iterations: int | None = None,
+          damping: float | None = None, tolerance: float | None = None, sites: SiteSettings | str | None = None,
+          method: str | None = None) -> Panel:
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.
 
     The plate's name is the dimension of the series in the result of `lfm_ppl.fit`; `lfm_ppl.select_series` returns one
@@ -212,7 +216,7 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         parameters: pytree of arrays with a leading axis (B,), one entry a series.
         times: (T,) for all, or (B, T); ragged series are padded: NaN in y, and times that repeat the last one.
         rule: as in `MarginalLikelihood`, and so are the next seven.
-        steps: integration steps between two consecutive times.
+        steps: integration steps between two consecutive times; 10 by default.
         max_step: longest step.
         iterations: of posterior linearisation; by default 3 for models that are not linear, see `MarginalLikelihood`.
         damping: largest share of each new iterate that is taken; less where the iterates turn back.
@@ -236,6 +240,6 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         >>> lfm.panel(build, {"rate": jnp.array([0.5, 1.0])}, jnp.arange(3.0)).batch_shape
         (2,)
     """
-    settings = {"rule": as_rule(rule), "steps": steps, "max_step": max_step, "iterations": iterations,
-                "damping": damping, "tolerance": tolerance, "sites": sites, "method": method}
-    return Panel(build, parameters, times, settings)
+    arguments = {"rule": rule, "steps": steps, "max_step": max_step, "iterations": iterations, "damping": damping,
+                 "tolerance": tolerance, "sites": sites, "method": method}
+    return Panel(build, parameters, times, arguments)

@@ -49,7 +49,7 @@ class ParticleLikelihood(dist.Distribution):
         return self.base.mapped(self._series_log_prob, value, self.base.split_key(self.key))
 
     def _series_log_prob(self, base: SeriesLikelihood, y: jax.Array, key: jax.Array) -> jax.Array:
-        grid = build_time_grid(base.ssm, base.times, self.steps or base.steps, base.max_step)
+        grid = build_time_grid(base.ssm, base.times, self.steps or base.settings.steps, base.settings.max_step)
         return log_likelihood(base.ssm, grid, y, key, self.settings)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:

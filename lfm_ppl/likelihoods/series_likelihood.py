@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ import numpyro.distributions as dist
 from numpyro.distributions import constraints
 from numpyro.primitives import _PYRO_STACK
 
-from lfm_ppl.filtering.arguments import as_rule, check_observations, warn_single_precision
+from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.breakdown import warn_of_breakdown, warn_of_iterations
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
 from lfm_ppl.filtering.ep.settings import SiteSettings
@@ -36,8 +36,8 @@ from lfm_ppl.filtering.smoother import SmootherResult, filtered_mean, smooth_on
 from lfm_ppl.filtering.stiffness import ExplicitSteps, explicit_steps, warn_of_long_steps
 from lfm_ppl.filtering.time_grid import build_time_grid, lay_out_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
+from lfm_ppl.likelihoods.filter_settings import FilterSettings
 from lfm_ppl.likelihoods.likelihood import Likelihood
-from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.events import EventTable, event_table
 from lfm_ppl.model.inputs import InputRead
@@ -56,25 +56,21 @@ class SeriesLikelihood(Likelihood):
     Args:
         model: the latent force model; it may hold traced parameters.
         times: (T,), non-decreasing.
-        rule: linearisation rule; `Cubature()` by default.
-        steps: integration steps between two consecutive times.
+        settings: of its filter.
+        given: names of the settings that the model names; the others have their defaults.
     """
 
     support = constraints.real_matrix
     pytree_data_fields: tuple[str, ...] = ("model", "times")
-    pytree_aux_fields: tuple[str, ...] = ("rule", "steps")
-    max_step: float | None = None
-    iterations: int = 0
-    damping: float = 0.7
-    tolerance: float | None = None
-    method: str = DEFAULT_METHOD
-    sites: SiteSettings | None = None
+    pytree_aux_fields: tuple[str, ...] = ("settings", "given")
+    accepted: ClassVar[tuple[str, ...]] = FilterSettings.names()
+    """Names of the settings that the constructor takes."""
     layout: GridLayout | None = None
     regime_names: tuple[str, ...] = ()
 
-    def __init__(self, model: LatentForceModel, times: Any, rule: Rule | None, steps: int) -> None:
+    def __init__(self, model: LatentForceModel, times: Any, settings: FilterSettings, given: frozenset[str]) -> None:
         refuse_times_by_site(times)
-        self.model, self.times, self.rule, self.steps = model, times, as_rule(rule), steps
+        self.model, self.times, self.settings, self.given = model, times, settings, given
         concrete_times = checks.concrete(times)
         if concrete_times is None:
             # The time grid of traced times may come from outside, by `with_times`.
@@ -115,29 +111,31 @@ class SeriesLikelihood(Likelihood):
         if self.layout is not None:
             return self.grid_of(self.layout)
         layout, reads, events = self._laid_out
-        return layout.complete(reads, events)._replace(method=self.method)
+        return layout.complete(reads, events)._replace(method=self.settings.method)
 
     @functools.cached_property
     def _laid_out(self) -> tuple[GridLayout, list[InputRead], EventTable]:
-        return lay_out_time_grid(self.ssm, self.times, self.steps, self.max_step, tolerance=self.tolerance)
+        settings = self.settings
+        return lay_out_time_grid(self.ssm, self.times, settings.steps, settings.max_step, tolerance=settings.tolerance)
 
     def lay_out(self, requested_times: Any = None) -> GridLayout:
         """Return the layout of the time grid with requested times (K,); None: the times of the data."""
         if requested_times is None:
             return self._laid_out[0]
-        return lay_out_time_grid(self.ssm, self.times, self.steps, self.max_step, requested_times,
-                                 tolerance=self.tolerance)[0]
+        settings = self.settings
+        return lay_out_time_grid(self.ssm, self.times, settings.steps, settings.max_step, requested_times,
+                                 tolerance=settings.tolerance)[0]
 
     def grid_of(self, layout: GridLayout) -> TimeGrid:
         """Return the time grid of a layout of this likelihood, for its parameters."""
         reads = self.model.input_reads(0.0, 1.0) if any(layout.is_lagged + layout.is_event_lagged) else ()
-        return layout.complete(reads, event_table(self.model.events))._replace(method=self.method)
+        return layout.complete(reads, event_table(self.model.events))._replace(method=self.settings.method)
 
     # Not cached: it is computed from traced parameters, inside the function that `finite_or_minus_infinity` guards.
     @property
     def problem(self) -> FilterProblem:
         """The filter problem: model, rule and time grid, with what all intervals share."""
-        return filter_problem(self.ssm, self.rule, self.time_grid)
+        return filter_problem(self.ssm, self.settings.rule, self.time_grid)
 
     @property
     def is_family(self) -> bool:
@@ -152,12 +150,13 @@ class SeriesLikelihood(Likelihood):
     @property
     def integrators(self) -> tuple[Integrator, ...]:
         """The integrators of all regimes; one but for a likelihood with several."""
-        return tuple(choose_integrator(ssm, self.rule, self.method, self.tolerance) for ssm in self.ssms)
+        settings = self.settings
+        return tuple(choose_integrator(ssm, settings.rule, settings.method, settings.tolerance) for ssm in self.ssms)
 
     @property
     def is_stiff(self) -> bool:
         """Whether the method of integration is one for stiff dynamics, so that simulated steps are exponential, too."""
-        return not METHODS[self.method].is_explicit
+        return not METHODS[self.settings.method].is_explicit
 
     @property
     def has_gaussian_state(self) -> bool:
@@ -170,9 +169,9 @@ class SeriesLikelihood(Likelihood):
         return self.is_family
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """Arguments of `lfm_ppl.MarginalLikelihood` besides model and times."""
-        raise NotImplementedError
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor besides model and times, without settings that are left open."""
+        return {name: getattr(self.settings, name) for name in sorted(self.given)}
 
     @property
     def description(self) -> str:
@@ -182,8 +181,11 @@ class SeriesLikelihood(Likelihood):
     @property
     def recorded_settings(self) -> dict[str, Any]:
         """Settings of the filter as a result records them; what is None is not stored."""
-        return {"rule": self.rule.name, "steps": self.steps, "max_step": self.max_step, "iterations": self.iterations,
-                "tolerance": self.tolerance, "method": None if self.method == DEFAULT_METHOD else self.method}
+        settings = self.settings
+        recorded = {"rule": settings.rule.name, "steps": settings.steps, "max_step": settings.max_step,
+                    "iterations": settings.iterations, "tolerance": settings.tolerance,
+                    "method": None if settings.method == DEFAULT_METHOD else settings.method}
+        return {name: value for name, value in recorded.items() if name in self.accepted}
 
     @property
     def site_settings(self) -> SiteSettings:
@@ -230,17 +232,17 @@ class SeriesLikelihood(Likelihood):
         """
         y = self.checked(y)
         result = self._filter(y)
-        warn_of_long_steps(self.ssm, self.rule, self.time_grid, self.steps, result.filtered_mean,
+        warn_of_long_steps(self.ssm, self.settings.rule, self.time_grid, self.settings.steps, result.filtered_mean,
                            result.log_likelihood)
         return result
 
     def _filter(self, y: jax.Array) -> FilterResult:
-        return filter_on(self.ssm, self.rule, self.time_grid, y, jnp.asarray(self.times, float))
+        return filter_on(self.ssm, self.settings.rule, self.time_grid, y, jnp.asarray(self.times, float))
 
     def warn_of_long_steps(self, y: jax.Array, log_likelihood: jax.Array) -> None:
         """Warn where a step is too long for a fast decay, outside of compiled code; y (T, D) is checked."""
-        warn_of_long_steps(self.ssm, self.rule, self.time_grid, self.steps, lambda: self._filter(y).filtered_mean,
-                           log_likelihood)
+        warn_of_long_steps(self.ssm, self.settings.rule, self.time_grid, self.settings.steps,
+                           lambda: self._filter(y).filtered_mean, log_likelihood)
 
     @property
     def has_explicit_steps(self) -> bool:
@@ -265,8 +267,9 @@ class SeriesLikelihood(Likelihood):
             return self.time_grid
         if isinstance(requested_times, GridLayout):
             return self.grid_of(requested_times)
-        return build_time_grid(self.ssm, self.times, self.steps if steps is None else steps, self.max_step,
-                               requested_times, tolerance=self.tolerance)._replace(method=self.method)
+        settings = self.settings
+        return build_time_grid(self.ssm, self.times, settings.steps if steps is None else steps, settings.max_step,
+                               requested_times, tolerance=settings.tolerance)._replace(method=settings.method)
 
     def smooth(self, y: Any, at: Any = None, steps: int | None = None) -> SmootherResult:
         """Smooth with this distribution's settings, or with other ``steps``; see `lfm_ppl.smooth`.
@@ -279,10 +282,11 @@ class SeriesLikelihood(Likelihood):
             steps: integration steps between two consecutive times; None: `steps` of the distribution.
         """
         grid, y = self.smoother_grid(at, steps), self.checked(y)
-        result = smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
+        result = smooth_on(self.ssm, self.settings.rule, grid, y, self.settings.iterations, self.settings.damping,
+                           self.site_settings)
         if not self.is_family:
             warn_of_iterations(result.change, result.log_likelihood_change)
-        warn_of_long_steps(self.ssm, self.rule, grid, self.steps if steps is None else steps,
+        warn_of_long_steps(self.ssm, self.settings.rule, grid, self.settings.steps if steps is None else steps,
                            lambda: filtered_mean(result, grid), result.log_likelihood)
         return result
 
@@ -293,7 +297,7 @@ class SeriesLikelihood(Likelihood):
         """
         y = self.checked(value)
         log_likelihood = self._guarded_terms(y, lambda terms: terms)
-        warn_of_breakdown(self.ssm, self.rule, self.time_grid, y, None, log_likelihood, None, True)
+        warn_of_breakdown(self.ssm, self.settings.rule, self.time_grid, y, None, log_likelihood, None, True)
         return log_likelihood
 
     def sample_path(self, key: jax.Array, y: jax.Array, at: Any = None) -> tuple[jax.Array, jax.Array]:
@@ -348,8 +352,9 @@ class SeriesLikelihood(Likelihood):
         previous = change
         if self.is_family:
             return assumed_density_filter(problem, y).log_likelihood, jnp.full(2, jnp.nan)
-        if self.iterations:
-            points, change, previous = posterior_linearisation(problem, updater, self.iterations, self.damping)
+        iterations = self.settings.iterations
+        if iterations:
+            points, change, previous = posterior_linearisation(problem, updater, iterations, self.settings.damping)
         terms = at_intervals(forward(problem, updater, about=points).log_likelihood, self.time_grid.observed)
         return terms, jnp.stack([change, terms.sum() - previous])
 
@@ -358,7 +363,7 @@ class SeriesLikelihood(Likelihood):
 
         Outside of compiled code there is a warning where the iterations have not settled.
         """
-        if self.is_family or self.iterations < 2 or checks.traced((self.ssm, self.time_grid, y)):
+        if self.is_family or self.settings.iterations < 2 or checks.traced((self.ssm, self.time_grid, y)):
             return finite_or_minus_infinity(lambda y: reduce(self._terms_and_changes(y)[0]), y)
 
         def values_and_changes(y: jax.Array) -> jax.Array:

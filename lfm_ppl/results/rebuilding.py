@@ -24,7 +24,9 @@ from lfm_ppl.io.data_set import (
     keywords_by_site,
     model_keywords,
 )
+from lfm_ppl.likelihoods.handlers.approximate import complete
 from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite
+from lfm_ppl.linearisation.named_rules import named_rule
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.results.series import TIMES, is_selected_series, series_labels, times_of
@@ -193,15 +195,15 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
         stored = observations(result)
         times, y = stored[0] if times is None else times, stored[1] if y is None else y
     arguments = keywords(result, None, model_kwargs)
+    settings = arviz_data.sites_of(result)
     try:
-        bound = bind(numpyro_model, times, y, **arguments)
+        bound = bind(_as_fitted(numpyro_model, settings or {"": attrs}), times, y, **arguments)
     except (TypeError, AttributeError) as error:
         missing = _missing_keywords(numpyro_model, arguments)
         if not missing or not re.search("NoneType|required", str(error)):
             raise
         example = ", ".join(f"{name!r}: ..." for name in missing)
         raise TypeError(f"the model needs {', '.join(missing)}: pass model_kwargs={{{example}}}.") from error
-    settings = arviz_data.sites_of(result)
     for name, site_model in bound.site_models.items():
         _check_settings(site_model.site, settings.get(name, {}) if settings else attrs)
     bound = bound.fix(json.loads(attrs.get("fixed") or "{}"))
@@ -213,6 +215,22 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
 def further_parameters(numpyro_model: Callable) -> dict[str, inspect.Parameter]:
     """Return the parameters of a model after times and y, by name."""
     return dict(list(inspect.signature(numpyro_model).parameters.items())[2:])
+
+
+def _as_fitted(numpyro_model: Callable, recorded: Mapping[str, Mapping[str, Any]]) -> Callable:
+    """Return the model with the settings that a result records, by likelihood site, where the model leaves them open.
+
+    Args:
+        numpyro_model: the model.
+        recorded: name of a site, or "" for the only one -> attributes of the result.
+    """
+    for site, attrs in recorded.items():
+        settings = {name: attrs[name] for name in ("steps", "iterations", "method") if name in attrs}
+        if rule := named_rule(str(attrs.get("rule", "None"))):
+            settings["rule"] = rule
+        numpyro_model = complete(numpyro_model, **settings)
+        numpyro_model.only_site = site or None
+    return numpyro_model
 
 
 def _missing_keywords(numpyro_model: Callable, arguments: Mapping[str, Any]) -> list[str]:

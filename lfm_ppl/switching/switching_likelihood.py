@@ -13,7 +13,7 @@ Journal of Selected Topics in Signal Processing 10(2).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.breakdown import FilterWarning
-from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS
 from lfm_ppl.filtering.intervals import TimeGrid, with_state_maps
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
@@ -32,6 +31,7 @@ from lfm_ppl.filtering.stiffness import (
     long_step_message,
     warn_of_message,
 )
+from lfm_ppl.likelihoods.filter_settings import FilterSettings
 from lfm_ppl.likelihoods.marginal_likelihood import SIMULATION_STEPS
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
@@ -101,7 +101,8 @@ class Switching(SeriesLikelihood):
             ``models``; zero on the diagonal, or with rows that sum to zero. They may be sampled.
         times: (T,), non-decreasing.
         rule: linearisation rule; `Cubature()` by default.
-        steps: integration steps between two consecutive times; a linear time-invariant model is exact with any number.
+        steps: integration steps between two consecutive times, by default 10; a linear time-invariant model is exact
+            with any number.
         max_step: longest step, in units of time; longer intervals get more steps.
         initial: (K,), probabilities of the regimes at the first observation; None: equal ones.
         merging: "gpb2", K^2 filters a row; "gpb3" and "gpb4", K^3 and K^4 filters, for regimes whose states stay
@@ -134,20 +135,21 @@ class Switching(SeriesLikelihood):
     """
 
     pytree_data_fields = ("models", "rates", "initial")
-    pytree_aux_fields = ("regime_names", "merging", "max_step", "method")
+    pytree_aux_fields = ("regime_names", "merging")
+    accepted: ClassVar[tuple[str, ...]] = ("rule", "steps", "max_step", "method")
 
     def __init__(self, models: Mapping[str, LatentForceModel], rates: ArrayLike, times: ArrayLike,
-                 rule: Rule | None = None, steps: int = 10, max_step: float | None = None, *,
-                 initial: ArrayLike | None = None, merging: str = "gpb2", method: str = DEFAULT_METHOD) -> None:
+                 rule: Rule | None = None, steps: int | None = None, max_step: float | None = None, *,
+                 initial: ArrayLike | None = None, merging: str = "gpb2", method: str | None = None) -> None:
         checks.one_of("merging", merging, MERGINGS)
-        checks.one_of("method", method, METHODS)
         by_name = check_models(models)
         count = len(by_name)
         self.models, self.regime_names = tuple(by_name.values()), tuple(by_name)
         self.rates = check_rates(rates, count)
         self.initial = check_probabilities(jnp.full(count, 1.0 / count) if initial is None else initial, count)
-        self.merging, self.max_step, self.method = merging, max_step, method
-        super().__init__(joint_model(by_name, self.initial), times, rule, steps)
+        self.merging = merging
+        settings, given = FilterSettings.of({"rule": rule, "steps": steps, "max_step": max_step, "method": method})
+        super().__init__(joint_model(by_name, self.initial), times, settings, given)
 
     @property
     def has_gaussian_state(self) -> bool:
@@ -155,9 +157,9 @@ class Switching(SeriesLikelihood):
         return False
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """Arguments besides models, rates and times."""
-        return {name: getattr(self, name) for name in ("rule", "steps", "max_step", "initial", "merging", "method")}
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor besides models, rates and times, without settings that are left open."""
+        return super().arguments | {"initial": self.initial, "merging": self.merging}
 
     def with_settings(self, **settings: Any) -> Switching:
         """Return the same distribution with another ``rule``, ``steps``, ``max_step`` or ``method``.
@@ -165,12 +167,12 @@ class Switching(SeriesLikelihood):
         They are the numerics of each regime. ``merging`` is none: it is the approximation itself, with the number of
         filters, as ``initial`` is a part of the model. For another one construct the distribution again.
         """
-        names = ("rule", "steps", "max_step", "method")
         for name in settings:
-            if name not in names:
-                raise ValueError(f"{name} is not a setting of lfm.Switching, whose settings are {', '.join(names)}.")
+            if name not in self.accepted:
+                raise ValueError(f"{name} is not a setting of lfm.Switching, whose settings are "
+                                 f"{', '.join(self.accepted)}.")
         models = dict(zip(self.regime_names, self.models, strict=True))
-        return Switching(models, self.rates, self.times, **{**self.settings, **settings})
+        return Switching(models, self.rates, self.times, **self.arguments | settings)
 
     @property
     def description(self) -> str:
@@ -185,7 +187,7 @@ class Switching(SeriesLikelihood):
     def regimes(self, grid: TimeGrid | None = None) -> RegimeProblem:
         """Return the filter problems of the regimes and the chain on a time grid; None: that of the data."""
         grid = self.time_grid if grid is None else grid
-        problems = tuple(filter_problem(ssm, self.rule, grid) for ssm in self.ssms)
+        problems = tuple(filter_problem(ssm, self.settings.rule, grid) for ssm in self.ssms)
         return RegimeProblem(problems, self.initial, *regime_transitions(self.rates, grid), MERGINGS[self.merging])
 
     def log_prob(self, value: Any) -> jax.Array:
@@ -199,7 +201,7 @@ class Switching(SeriesLikelihood):
         log_likelihood = finite_or_minus_infinity(lambda y: self._one_step_ahead(y).sum(), y)
         if checks.concrete(log_likelihood) == -np.inf:
             checks.warn(self.breakdown(y), FilterWarning)
-        self._warn_of_long_steps(self.time_grid, self.steps, y, log_likelihood)
+        self._warn_of_long_steps(self.time_grid, self.settings.steps, y, log_likelihood)
         return log_likelihood
 
     def explicit_steps(self, y: jax.Array, requested_times: Any = None) -> ExplicitSteps | None:
@@ -265,7 +267,7 @@ class Switching(SeriesLikelihood):
         grid = self.smoother_grid(at, steps)
         # One program: eager operations take longer to compile, one by one.
         result = Program(lambda y: self._smooth(y, grid))(y)
-        self._warn_of_long_steps(grid, self.steps if steps is None else steps, y, result.log_likelihood)
+        self._warn_of_long_steps(grid, self.settings.steps if steps is None else steps, y, result.log_likelihood)
         return result
 
     def _smooth(self, y: jax.Array, grid: TimeGrid) -> RegimeSmootherResult:
@@ -323,7 +325,7 @@ class Switching(SeriesLikelihood):
         """Simulate the real model: (x, indicators of the regimes, u) (T, M + K + R), and observations (T, D)."""
         ssms, times = self.ssms, np.asarray(self.times, float)
         initial_key, path_key = jax.random.split(key)
-        grid = with_state_maps(ssms[0], self.smoother_grid(None, SIMULATION_STEPS * self.steps))
+        grid = with_state_maps(ssms[0], self.smoother_grid(None, SIMULATION_STEPS * self.settings.steps))
         distinct = np.unique(times)
         # The decision at the last time has no consequences.
         chain = MarkovChain(distinct, transition_matrices(self.rates, jnp.diff(distinct, append=distinct[-1])))

@@ -12,10 +12,13 @@ import numpy as np
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.problem import signature
+from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.inference.trajectories import has_noise_of_rows
 from lfm_ppl.io.data import as_data
 from lfm_ppl.io.data_set import Data, at_origin, in_unit, keywords_by_site, model_keywords
 from lfm_ppl.io.table import is_table
+from lfm_ppl.likelihoods.handlers.approximate import complete
 from lfm_ppl.model.events import Event
 from lfm_ppl.model.inputs import Input
 from lfm_ppl.utils import calendar_time, checks, date_warnings
@@ -142,6 +145,28 @@ def _check_unit_of_inputs(model_kwargs: Mapping[str, Any] | None, data: Data | N
     if data.origin is None:
         checks.warn(f"the times of the data are converted from {unit} to {model_unit}, the unit of the model. The "
                     f"times of known inputs and doses in model_kwargs are not, and are taken to be in {model_unit}.")
+
+
+def completed_model(numpyro_model: Callable, settings: Mapping[str, Any]) -> Callable:
+    """Return the model with settings of its likelihoods by name, where it leaves them open."""
+    def modify(model: Callable) -> Callable:
+        return complete(model, **settings)
+
+    if not settings or not callable(numpyro_model):
+        return numpyro_model
+    if isinstance(numpyro_model, SharedModel):
+        return numpyro_model.modified(("complete", signature(dict(settings))), modify)
+    return modify(numpyro_model)
+
+
+def warn_of_named_settings(bound: BoundModel, settings: Mapping[str, Any]) -> None:
+    """Warn of settings of `lfm_ppl.fit` of which the model names other values, which stay."""
+    for site_model in bound.site_models.values():
+        likelihood, name = site_model.site.example, site_model.site.name
+        for setting, value in settings.items():
+            if (named := getattr(likelihood.settings, setting)) != value:
+                checks.warn(f"the model names {setting}={named} in its likelihood {name!r}, which stays: {setting}="
+                            f"{value} has no effect. lfm.approximate(model, {setting}=...) replaces it.")
 
 
 def data_by_site(times: Any, y: Any) -> dict[str, Any] | None:
@@ -294,7 +319,9 @@ def check_requested_times(bound: BoundModel, times: Any, name: str = "at") -> No
     members = bound.site.members if has_series_times else [example]
     for series, (member, observed, requested) in enumerate(zip(members, data_times, rows, strict=True)):
         try:
-            build_time_grid(member.ssm, observed, member.steps, member.max_step, requested, tolerance=member.tolerance)
+            settings = member.settings
+            build_time_grid(member.ssm, observed, settings.steps, settings.max_step, requested,
+                            tolerance=settings.tolerance)
         except ValueError as error:
             raise ValueError(f"series {series}: {error}" if has_series_times else str(error)) from None
 

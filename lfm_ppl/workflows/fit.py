@@ -37,6 +37,7 @@ from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.inference.start_failure import start_failure
+from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
@@ -49,9 +50,11 @@ from lfm_ppl.workflows.data_binding import (
     SiteData,
     bind_data,
     check_requested_times,
+    completed_model,
     coords_of_site,
     of_site,
     warn_of_missing_predictions,
+    warn_of_named_settings,
 )
 from lfm_ppl.workflows.fit_options import (
     FitOptions,
@@ -97,6 +100,10 @@ def fit(
     trajectory_draws: int = 400,
     model_kwargs: Mapping[str, Any] | None = None,
     fixed: Mapping[str, ArrayLike] | None = None,
+    rule: Rule | None = None,
+    steps: int | None = None,
+    iterations: int | None = None,
+    method: str | None = None,
     init: Any = None,
     sampler_options: Mapping[str, Any] | None = None,
     chain_method: str | None = None,
@@ -142,6 +149,10 @@ def fit(
         model_kwargs: keyword arguments of the model. A second fit of the model to other data, times, known inputs and
             real arrays of the same shapes compiles nothing, with the exceptions of `lfm.bind`.
         fixed: fixed parameters: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
+        rule: linearisation rule of the likelihoods, where the model leaves it open; as in `MarginalLikelihood`.
+        steps: the same for the integration steps between two consecutive times.
+        iterations: the same for the iterations of posterior linearisation.
+        method: the same for the method of integration.
         init: starting points. By default, or with "map", draws about the posterior mode. For NUTS they come from the
             Laplace approximation N(mode, C) widened to twice its standard deviations. C, the inverse Hessian, is the
             (dense) inverse mass matrix at the start of the warm-up, and its estimates are regularised towards C. Where
@@ -212,8 +223,8 @@ def fit(
         KeyboardInterrupt: Ctrl-C before the first draw, without a checkpoint, or for the second time.
 
     Warns:
-        UserWarning: the result is partial; new observations ``at`` these times cannot be predicted, because their
-            noise is given row by row.
+        UserWarning: the result is partial; the model names another rule or number of steps than ``fit``; new
+            observations ``at`` these times cannot be predicted, because their noise is given row by row.
         ConvergenceWarning: R-hat above 1.01, fewer than 100 effective draws a chain, divergences, a degenerate
             posterior mode; each with a remedy.
         ApproximationWarning: more iterations, shorter steps or a smaller ``max_step`` would change the posterior;
@@ -242,7 +253,10 @@ def fit(
         raise ValueError("resume continues a run that is stored in a folder; name the folder, checkpoint=...")
     if checkpoint is not None:
         checkpoints.check_folder(checkpoint, resume, overwrite)
-    bound, series, clock, model_kwargs = bind_data(numpyro_model, times, y, model_kwargs)
+    settings = {name: value for name, value in (("rule", rule), ("steps", steps), ("iterations", iterations),
+                                                ("method", method)) if value is not None}
+    bound, series, clock, model_kwargs = bind_data(completed_model(numpyro_model, settings), times, y, model_kwargs)
+    warn_of_named_settings(bound, settings)
     names = list(series) if bound.is_by_site else []
     if names and sampler == "pmmh":
         raise ValueError("sampler 'pmmh' takes a model with one likelihood site, and there are data of "
@@ -264,7 +278,7 @@ def fit(
         thin = thin or SAMPLERS[sampler].steps_per_draw * bound.size or 1
         chain_method = sampling.available_method(chain_method, chains)
     options = FitOptions(sampler, chains, warmup, samples, thin, seed, dict(fixed or {}), at, trajectory_draws, init,
-                         dict(sampler_options or {}), chain_method)
+                         dict(sampler_options or {}), chain_method, settings)
     title = str(name or getattr(numpyro_model, "__name__", "model"))
     description = {
         "model": title, "description": model_docstring(numpyro_model),

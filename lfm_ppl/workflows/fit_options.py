@@ -45,6 +45,7 @@ class FitOptions:
         init: starting points.
         sampler_options: arguments of the sampler's kernel.
         chain_method: "parallel", "vectorized" or "sequential"; None for "map".
+        settings: of the likelihoods, where the model leaves them open.
     """
 
     sampler: str
@@ -59,6 +60,7 @@ class FitOptions:
     init: Any
     sampler_options: dict[str, Any]
     chain_method: str | None
+    settings: dict[str, Any]
 
     @functools.cached_property
     def keys(self) -> dict[str, jax.Array]:
@@ -98,7 +100,7 @@ class FitOptions:
             "sampler": self.sampler, "chains": self.chains, "warmup": self.warmup, "samples": self.samples,
             "thin": self.thin, "seed": self.seed, "trajectory_draws": self.trajectory_draws,
             "chain_method": self.chain_method, "init": self.init, "sampler_options": self.sampler_options,
-            "fixed": {name: np.asarray(value).tolist() for name, value in self.fixed.items()},
+            "fixed": {name: np.asarray(value).tolist() for name, value in self.fixed.items()}, **self.settings,
         }  # fmt: skip
         values = [f"{name}={value!r}" if isinstance(value, (str, int, float, dict)) else f"{name}={name}"
                   for name, value in arguments.items() if value is not None and value != {}]

@@ -14,7 +14,6 @@ from scipy.stats import multivariate_normal
 from systems import Linear, whole_state
 
 import lfm_ppl as lfm
-from lfm_ppl.likelihoods.handlers.settings import approximate
 
 NOISE = 0.08**2
 
@@ -146,7 +145,7 @@ def test_settings_that_constraints_do_not_take():
 
     for settings, name in (({"iterations": 2}, "iterations"), ({"max_step": 0.1}, "steps"),
                            ({"tolerance": 0.1}, "steps"), ({"method": "exponential"}, "method")):
-        constrained = approximate(unconstrained, lower={"factor": 0.0}, **settings)
+        constrained = lfm.approximate(unconstrained, lower={"factor": 0.0}, **settings)
         with pytest.raises(ValueError, match=name):
             numpyro.handlers.trace(numpyro.handlers.seed(constrained, jax.random.key(0))).get_trace(times)
     counts = lfm.LatentForceModel(Linear(jnp.array([[-0.6]]), jnp.array([[0.25]])), {"u": lfm.Matern(1.0, 1.0)},

@@ -132,14 +132,14 @@ def test_smoother_and_likelihood_have_one_default(model):
     assert np.isclose(smoother, likelihood, rtol=1e-12)
     assert abs(smoother - single_pass) > 1e-4
     assert np.isfinite(change)
-    assert lfm.MarginalLikelihood(model, TIMES).iterations == 3
+    assert lfm.MarginalLikelihood(model, TIMES).settings.iterations == 3
 
 
 @pytest.mark.parametrize(("model", "settings"), [
     (motif(identity, genes=1), {}), pytest.param(double_well(), {"tolerance": 1e-3}, marks=pytest.mark.slow)])
 def test_a_single_pass_is_the_default_of_a_linear_model_and_with_a_tolerance(model, settings):
     result = lfm.smooth(model, TIMES, Y, **settings)
-    assert lfm.MarginalLikelihood(model, TIMES, **settings).iterations == 0
+    assert lfm.MarginalLikelihood(model, TIMES, **settings).settings.iterations == 0
     assert np.isnan(result.change) and np.isnan(result.log_likelihood_change)
     np.testing.assert_allclose(result.log_likelihood, lfm.filter(model, TIMES, Y, **settings).log_likelihood, rtol=1e-9)
 

@@ -237,7 +237,7 @@ def test_fixed_parameters_and_settings(bound):
     assert fixed.names == ("lengthscale", "noise_sd[0]")
     assert float(fixed.constrain(np.zeros(2))["noise_sd"][1]) == pytest.approx(0.2)
     finer = bound.approximate(steps=9)
-    assert finer.site.example.steps == 9 and bound.site.example.steps == 1
+    assert finer.site.example.settings.steps == 9 and bound.site.example.settings.steps == 1
 
 
 def test_a_model_that_asks_its_data_for_values():

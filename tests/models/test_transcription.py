@@ -15,7 +15,6 @@ import lfm_ppl as lfm
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.optimise import newton, quasi_newton
 from lfm_ppl.io import loading
-from lfm_ppl.likelihoods.handlers.settings import approximate
 from lfm_ppl.results.arviz_data import group, summary
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -210,7 +209,7 @@ def test_log_evidence_is_that_of_importance_sampling(file, activity, link):
     """Within 0.05 at ten draws from the posterior of the p53 data; a single pass is off by up to six nats."""
     data = file.prepare(lfm.read_csv(P53))
     keywords = file.keywords(data, {"link": link})
-    bound = bind(approximate(file.model, iterations=0), data.times, data.y, **keywords).fix(file.anchors(data))
+    bound = bind(lfm.approximate(file.model, iterations=0), data.times, data.y, **keywords).fix(file.anchors(data))
     objective = bound.objective()
     mode = newton(objective, quasi_newton(objective, bound.draw(jax.random.key(0))).point)
     errors, of_single_pass = [], []
@@ -221,7 +220,7 @@ def test_log_evidence_is_that_of_importance_sampling(file, activity, link):
         exact, error, effective = log_evidence(parameters, np.asarray(data.times), np.asarray(data.y),
                                                lambda u: activity(u, link, 0.5))
         assert error < 0.005 and effective > 10_000
-        result = {n: trace(condition(approximate(file.model, iterations=n), parameters)).get_trace(
+        result = {n: trace(condition(lfm.approximate(file.model, iterations=n), parameters)).get_trace(
             data.times, data.y, **keywords)["y"] for n in (0, 3)}
         single, iterated = (float(site["fn"].log_prob(site["value"])) - exact for site in result.values())
         errors.append(iterated)

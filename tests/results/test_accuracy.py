@@ -17,7 +17,6 @@ from lfm_ppl.accuracy.check_accuracy import check_accuracy
 from lfm_ppl.accuracy.correction import correct_posterior
 from lfm_ppl.accuracy.report import AccuracyReport
 from lfm_ppl.accuracy.verdict import Findings, judge
-from lfm_ppl.likelihoods.handlers.settings import approximate
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.plots import plot_accuracy
 
@@ -242,7 +241,7 @@ def test_particles_and_grid_agree(bent):
 @pytest.mark.slow
 def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     """Importance weights from draws of the wrong posterior against quadrature with the exact likelihood."""
-    single_pass = approximate(well, iterations=0)
+    single_pass = lfm.approximate(well, iterations=0)
     result = arviz_data.build({name: arviz_data.group(bent, name) for name in ("posterior", "data")}, {})
     problem = rebuilding.problem(result, single_pass)
     nodes = np.linspace(0.15, 5.0, 60)

@@ -23,7 +23,6 @@ import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.samplers import SAMPLERS
-from lfm_ppl.likelihoods.handlers.settings import approximate
 from lfm_ppl.results import arviz_data, run_record
 from lfm_ppl.results import checkpoint as checkpoints
 from lfm_ppl.results.checkpoint import Checkpoint
@@ -188,7 +187,7 @@ def wider(times, y=None):
     ({"times": TIMES + 0.5}, "times"), ({"model": wider}, "model"), ({"at": [0.5, 4.5]}, "trajectories"),
     ({"sampler_options": {"target_accept_prob": 0.5}}, "target_accept_prob"),
     ({"chain_method": "sequential"}, "chain_method"), ({"init": "map"}, "init"),
-    ({"model": approximate(relaxation, steps=2)}, "steps"),
+    ({"model": lfm.approximate(relaxation, steps=2)}, "steps"),
 ])
 def test_another_run_is_not_resumed(unfinished, changes, name):
     before = {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()}

@@ -14,7 +14,7 @@ from scipy import stats
 from scipy.interpolate import CubicSpline
 
 import lfm_ppl as lfm
-from lfm_ppl.results import arviz_data
+from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.layout import Labels, checked_truth, unplaced
 from lfm_ppl.workflows import fit_starts
 from lfm_ppl.workflows.fit_options import FitOptions
@@ -548,3 +548,27 @@ def test_the_part_that_fails_is_named_where_there_is_nowhere_to_start(fault, rea
         lfm.fit(functools.partial(decaying_counts, fault=fault), times, DECAYING, progress=False, chains=1,
                 sampler="nuts" if fault == "gradient" else "map")
     assert "\n" not in str(error.value)
+
+
+def test_settings_that_the_model_leaves_open():
+    def model(times, y=None, steps=None):
+        rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.3))
+        system = lfm.LatentForceModel(
+            lambda x, u, t: u - rate * x**3, {"u": lfm.Matern(1.0, 1.0)},
+            lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=steps), obs=y)
+
+    y = np.sin(TIMES)[:, None]
+    settings = {"rule": lfm.GaussHermite(3), "steps": 2, "iterations": 1, "method": "exponential"}
+    fit = functools.partial(quiet_fit, model, TIMES, y, sampler="map", samples=10, trajectory_draws=0)
+    result = fit(**settings)
+    attributes = arviz_data.attributes(result)
+    assert (attributes["rule"], attributes["steps"], attributes["iterations"], attributes["method"]) == (
+        settings["rule"].name, 2, 1, "exponential")
+    assert "rule=rule, steps=2, iterations=1, method='exponential'" in attributes["call"]
+    rebuilt = rebuilding.problem(result, model).bound.site.example.settings
+    assert (rebuilt.rule, rebuilt.steps, rebuilt.iterations, rebuilt.method) == tuple(settings.values())
+    with pytest.warns(UserWarning, match=r"steps=2 .* 'y'.*steps=5 has no effect.*lfm\.approximate"):
+        named = fit(model_kwargs={"steps": 2}, **settings | {"steps": 5})
+    assert arviz_data.attributes(named)["steps"] == 2
+    np.testing.assert_allclose(group(named, "posterior")["rate"], group(result, "posterior")["rate"], rtol=1e-6)

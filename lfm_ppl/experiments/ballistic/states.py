@@ -7,7 +7,6 @@ particle's ancestor has a transition density to it that is not negligible.
 
 from __future__ import annotations
 
-import copy
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -45,8 +44,7 @@ def run_gaussian(task: Task) -> Result:
 @functools.cache
 def _gaussian_programs(rule: str) -> tuple[Callable, Callable]:
     """Return filter and smoother with the likelihood's steps, iterations and sites, compiled for all targets."""
-    likelihood = copy.copy(true_likelihood())
-    likelihood.rule = RULES[rule]
+    likelihood = true_likelihood().with_settings(rule=RULES[rule])
 
     def filtering(y: jax.Array) -> tuple[jax.Array, jax.Array]:
         result = likelihood.filter(y)

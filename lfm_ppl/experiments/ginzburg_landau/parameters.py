@@ -29,7 +29,7 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import grid_filter
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM
 from lfm_ppl.inference.kernels.ram import RAM
-from lfm_ppl.likelihoods.handlers.settings import approximate
+from lfm_ppl.likelihoods.handlers.approximate import approximate
 from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.model.state_space import state_space
 from lfm_ppl.parallel.task import Result, Task

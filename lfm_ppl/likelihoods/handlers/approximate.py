@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from lfm_ppl.likelihoods.constrained_likelihood import ConstrainedLikelihood, likelihood_with
+from lfm_ppl.likelihoods.constrained_likelihood import likelihood_with
 from lfm_ppl.likelihoods.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.likelihoods.likelihood import Likelihood
 from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
-from lfm_ppl.likelihoods.panel import Panel
 
 NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "method", "sites", "lower", "upper",
          "constraints", "grid", "draws")
@@ -38,9 +37,9 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
-        >>> finer = approximate(model, rule=lfm.GaussHermite(7), steps=20)
+        >>> finer = lfm.approximate(model, rule=lfm.GaussHermite(7), steps=20)
         >>> run = numpyro.handlers.seed(finer, jax.random.key(0))
-        >>> numpyro.handlers.trace(run).get_trace(jnp.arange(3.0))["y"]["fn"].steps
+        >>> numpyro.handlers.trace(run).get_trace(jnp.arange(3.0))["y"]["fn"].settings.steps
         20
     """
 
@@ -63,12 +62,22 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
 
     def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> Any:
         """Return the likelihood with the new settings."""
-        if not isinstance(likelihood, (Panel, MarginalLikelihood, ConstrainedLikelihood)):
-            return likelihood.with_settings(**self.settings)
         has_equal_steps = "steps" in self.settings or self.settings.get("iterations", 0) > 0
         is_single_pass = any(self.settings.get(name) for name in ("tolerance", "lower", "upper", "constraints"))
-        settings = likelihood.settings | ({"tolerance": None} if has_equal_steps else {})
-        settings |= ({"iterations": 0} if is_single_pass else {}) | self.settings
-        if isinstance(likelihood, Panel):
-            return Panel(likelihood.build, likelihood.parameters, likelihood.times, settings)
-        return likelihood_with(likelihood.model, likelihood.times, settings)
+        ended = ["tolerance"] * has_equal_steps + ["iterations"] * is_single_pass
+        settings = {name: None for name in ended if name in likelihood.arguments} | self.settings
+        if isinstance(likelihood, MarginalLikelihood):  # bounds make it another class
+            return likelihood_with(likelihood.model, likelihood.times, likelihood.arguments | settings)
+        return likelihood.with_settings(**settings)
+
+
+class complete(approximate):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
+    """Effect handler that sets those settings of the likelihood that the model leaves open; arguments as `approximate`.
+
+    What the model names stays.
+    """
+
+    def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> Any:
+        """Return the likelihood with the settings that were open."""
+        is_open = {name: value for name, value in self.settings.items() if name not in likelihood.arguments}
+        return likelihood.with_settings(**is_open) if is_open else likelihood

@@ -1,0 +1,63 @@
+"""Settings of the Gaussian filter of a likelihood, with their defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from lfm_ppl.filtering.arguments import as_rule, check_iterations
+from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
+from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS
+from lfm_ppl.linearisation.rule import Rule
+from lfm_ppl.linearisation.sigma_points import Cubature
+from lfm_ppl.utils import checks
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """Settings of the filter of one likelihood; see the arguments of `lfm_ppl.MarginalLikelihood`.
+
+    Attributes:
+        rule: linearisation rule.
+        steps: integration steps between two consecutive times.
+        max_step: longest step; None: twice the median step.
+        iterations: of posterior linearisation.
+        damping: largest share of each new iterate that is taken.
+        tolerance: largest error of an integration step, in standard deviations; None: equal steps.
+        method: of integration.
+        sites: of an observation family; None: expectation propagation.
+    """
+
+    rule: Rule = Cubature()
+    steps: int = 10
+    max_step: float | None = None
+    iterations: int = 0
+    damping: float = 0.7
+    tolerance: float | None = None
+    method: str = DEFAULT_METHOD
+    sites: SiteSettings | None = None
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the names of all settings."""
+        return tuple(field.name for field in fields(cls))
+
+    @classmethod
+    def of(cls, arguments: Mapping[str, Any]) -> tuple[FilterSettings, frozenset[str]]:
+        """Return settings from arguments of which None are open, and the names of those that are not.
+
+        Raises:
+            ValueError, TypeError: an argument out of its range, or iterations beside a tolerance.
+        """
+        given = {name: value for name, value in arguments.items() if value is not None}
+        if "rule" in given:
+            given["rule"] = as_rule(given["rule"])
+        check_iterations(given.get("iterations"), given.get("damping", cls.damping), given.get("tolerance"))
+        if "tolerance" in given:
+            checks.positive("tolerance", given["tolerance"], "It is in standard deviations, 0.001 for example.")
+            given["tolerance"] = float(given["tolerance"])
+        checks.one_of("method", given.get("method", cls.method), METHODS)
+        if "sites" in given:
+            given["sites"] = as_settings(given["sites"])
+        return cls(**given), frozenset(given)
