@@ -29,6 +29,7 @@ from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.trajectories import evenly_spaced
 from lfm_ppl.likelihoods.constrained_likelihood import ConstrainedLikelihood
+from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.resolution import resolution_messages
 from lfm_ppl.utils import checks
@@ -113,11 +114,10 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
     return [_message(refinement, size, len(rows)) for refinement, size in remedies]
 
 
-def resolution_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray]) -> list[str]:
-    """Return messages on steps and forces that are too coarse at the posterior medians of the parameters."""
-    likelihood = bound.likelihood({name: np.median(values, axis=0) for name, values in draws.items()})
-    first, y = likelihood.first, np.asarray(bound.y)
-    rows = y[0] if likelihood.batch_shape else y
+def resolution_warnings(site: LikelihoodSite) -> list[str]:
+    """Return messages on steps and forces that are too coarse for the likelihood at the posterior medians."""
+    first, y = site.example, np.asarray(site.observed)
+    rows = y[0] if site.distribution.batch_shape else y
     return [*_long_steps(first), *resolution_messages(first.model, first.times, rows)]
 
 

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.likelihoods.priors import central_interval
 
 
-def prior_conflicts(bound: BoundModel, draws: Mapping[str, np.ndarray]) -> list[str]:
+def prior_conflicts(trace: Mapping[str, Any], medians: Mapping[str, np.ndarray]) -> list[str]:
     """Return a message on the parameters whose posterior median lies outside of the central 99% of the prior.
 
     A prior that depends on other parameters is that at their posterior medians. Parameters in a plate are left out:
     among many of them some lie far out.
 
     Args:
-        bound: the model and its data.
-        draws: site name -> (S, ...), posterior draws.
+        trace: NumPyro's trace of the model at the posterior medians.
+        medians: site name -> posterior median.
     """
-    medians = {name: np.median(values, axis=0) for name, values in draws.items()}
-    trace = bound.trace_at(medians)
     conflicts = []
     for name, median in medians.items():
         site = trace.get(name)

@@ -28,7 +28,7 @@ from lfm_ppl.inference.trace import Programs, TracedModel, trace_model
 from lfm_ppl.likelihoods.handlers.approximate import approximate
 from lfm_ppl.likelihoods.handlers.fixing import fix
 from lfm_ppl.likelihoods.likelihood import Likelihood
-from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite, likelihood_site, remove_likelihood, single_site
+from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite, likelihood_sites, remove_likelihood, single_site
 from lfm_ppl.likelihoods.panel import Panel
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.programs import Program
@@ -101,7 +101,9 @@ class BoundModel:
         programs = programs or Programs()
         traced, constants, problem = trace_model(model, arguments, keywords, caller, programs)
         # Programs of constants serve no other data set, and end with the bound model.
-        return cls(traced, constants, problem, programs if problem.has_traced_inputs else Programs(), selected)
+        bound = cls(traced, constants, problem, programs if problem.has_traced_inputs else Programs(), selected)
+        bound._trace = None if checks.traced(bound.model_data) else traced.at_medians
+        return bound
 
     @property
     def y(self) -> Any:
@@ -267,14 +269,12 @@ class BoundModel:
             lambda z, problem: -traced.potential(z, problem, remove_likelihood)))
         return run(self._position(z), self.problem_of(y))
 
-    def site_log_priors(self, values: Mapping[str, Any], y: Any = None) -> dict[str, jax.Array]:
+    def site_log_priors(self, trace: Mapping[str, Any]) -> dict[str, jax.Array]:
         """Return the log prior density of each site, conditional on the sites that it depends on.
 
         Args:
-            values: site name -> value.
-            y: as in `log_density`.
+            trace: the result of `trace_at`.
         """
-        trace = self.trace_at(values, y)
         densities = {name: trace[name]["fn"].log_prob(trace[name]["value"]).sum() for name in self.sites}
         return {name: density if (scale := trace[name]["scale"]) is None else scale * density
                 for name, density in densities.items()}
@@ -419,6 +419,10 @@ class BoundModel:
         """Return NumPyro's trace of the model at values of its sites; ``y`` as in `log_density`."""
         return self.traced.trace_at(values, self._with_data(self.constants, y))
 
+    def site_of(self, trace: Mapping[str, Any]) -> LikelihoodSite:
+        """Return the likelihood site of a result of `trace_at`, with its observations."""
+        return single_site(likelihood_sites(trace), self._selected)
+
     # --- the filter and the smoother
 
     def likelihood(self, z: ArrayLike | Mapping[str, Any],
@@ -435,8 +439,7 @@ class BoundModel:
         """Return the likelihood site at parameters, with its observations."""
         traced = self.traced
         values = z if isinstance(z, Mapping) else traced.constrain(jnp.asarray(z, float), problem)
-        values = {name: values[name] for name in self.sites if name in values}
-        return likelihood_site(traced.with_times(problem), *problem.call(), traced.key, values, self._selected)
+        return self.site_of(traced.trace_at({name: values[name] for name in self.sites if name in values}, problem))
 
     def filter(self, z: ArrayLike | Mapping[str, Any], y: ArrayLike | None = None) -> FilterResult:
         """Return the result of the Gaussian filter at parameters z (d,), or site name -> value; see `lfm_ppl.filter`.

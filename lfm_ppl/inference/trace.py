@@ -102,20 +102,21 @@ class TracedModel:
         names: names of the unconstrained coordinates.
         size: number of unconstrained coordinates d.
         unravel: from z (d,) to the unconstrained value of each latent site.
-        likelihoods: the likelihood sites at the prior's medians, without observations.
+        at_medians: NumPyro's trace at the prior's medians, with the first data.
+        likelihoods: the likelihood sites of this trace, without observations.
         sites_of_times: names of likelihood sites that observe the times instead of the data.
     """
 
     def __init__(self, model: Callable, problem: Problem, caller: str) -> None:
         self.model, self.caller, self.key = model, caller, jax.random.key(0)
         self._seeded = handlers.seed(model, self.key)
-        trace = self.trace(problem)
-        likelihoods = likelihood_sites(trace)
+        self.at_medians = self.trace(problem)
+        likelihoods = likelihood_sites(self.at_medians)
         arguments, _ = problem.call()
         self.sites_of_times = [site.name for site in likelihoods if arguments and _equals(site.observed, arguments[0])
                                and not _contains(problem.observations, arguments[0])]
         self.likelihoods: tuple[LikelihoodSite, ...] = tuple(site._replace(observed=None) for site in likelihoods)
-        position = _unconstrained(latent_sites(trace))
+        position = _unconstrained(latent_sites(self.at_medians))
         self.sites = tuple(position)
         self.names = coordinate_names(position)
         flat, self.unravel = ravel_pytree(position)

@@ -72,8 +72,9 @@ def scores(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], particle
     """
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> dict[str, jax.Array]:
-        log_priors = {LOG_PRIOR + name: value for name, value in bound.site_log_priors(values, y).items()}
-        distribution, y = bound.likelihood(values, y), bound.data(y)
+        trace = bound.trace_at(values, y)
+        log_priors = {LOG_PRIOR + name: value for name, value in bound.site_log_priors(trace).items()}
+        distribution, y = bound.site_of(trace).distribution, bound.data(y)
         return distribution.mapped(of_series, y, distribution.split_key(key)) | log_priors
 
     def of_series(series: SeriesLikelihood, y: jax.Array, key: jax.Array) -> dict[str, jax.Array]:

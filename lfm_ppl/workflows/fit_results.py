@@ -170,11 +170,14 @@ def post_process(problem: FitProblem, draws: PosteriorDraws, store: Checkpoint |
                 scores, score_keys[name], site.bound, values, draws.particle_options.get("particle_settings"),
                 draws.particle_options.get("particle_steps"), **batch_options(label("scores", name))), None)
         processed.attributes = _site_attributes(problem, draws, values)
+        medians = {name: np.median(array, axis=0) for name, array in values.items()}
+        at_medians = best_effort("model at the posterior medians", partial(problem.bound.trace_at, medians), {})
         processed.warnings += best_effort("comparison with the priors", partial(
-            prior_conflicts, problem.bound, values), [])
+            prior_conflicts, at_medians, medians), [])
         for name, site in problem.sites.items():
-            warn(name, best_effort(label("resolution of the forces", name),
-                                   partial(resolution_warnings, site.bound, values), []))
+            if at_medians:
+                warn(name, best_effort(label("resolution of the forces", name),
+                                       partial(resolution_warnings, site.bound.site_of(at_medians)), []))
             if options.sampler in GAUSSIAN_FILTER_SAMPLERS:
                 log_likelihood = _log_likelihood(site.bound, processed.scores[name])
                 warn(name, best_effort(label("error of the likelihood", name), partial(
