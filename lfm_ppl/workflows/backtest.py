@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.io.data import as_data
-from lfm_ppl.io.data_set import model_keywords
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable
@@ -31,7 +30,7 @@ from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summar
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gaussian_residuals import TURN
 from lfm_ppl.utils.types import Times
-from lfm_ppl.workflows.data_binding import bind_dates
+from lfm_ppl.workflows.data_binding import bind_data
 from lfm_ppl.workflows.fit import fit
 from lfm_ppl.workflows.fit_results import ConvergenceWarning
 from lfm_ppl.workflows.forecast import check_possible
@@ -148,10 +147,10 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
         checks.positive_integer("season", season)
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level}.")
-    names = data = None
+    names, passed = None, (times, y)
     if y is None:
         data = as_data(times)
-        times, y, names = data.times, data.y, data.outputs
+        passed, times, y, names = (data, None), data.times, data.y, data.outputs
     checks.refuse_dates("times", times)
     times, y = (np.asarray(checks.unmask(value), float) for value in (times, y))
     y = y[:, None] if y.ndim == times.ndim == 1 else y
@@ -165,10 +164,8 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
                          "rows; put replicates into columns, or take their means.")
     origins = _origins(len(times), horizon, every, first)
     options = {"samples": draws if sampler == "map" else 1000, **options}
-    bound, data, _ = bind_dates(numpyro_model, times, y, data, options.get("model_kwargs"))
+    bound, _, _, options["model_kwargs"] = bind_data(numpyro_model, *passed, options.get("model_kwargs"))
     times = bound.times
-    if data is not None:
-        options["model_kwargs"] = model_keywords(data.inputs, options.get("model_kwargs"))
     bound = bound.fix(options.get("fixed"))
     check_possible(bound, times)
     model = bound.site.example.ssm.model

@@ -16,7 +16,7 @@ from lfm_ppl.inference.problem import signature
 from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.inference.trajectories import has_noise_of_rows
 from lfm_ppl.io.data import as_data
-from lfm_ppl.io.data_set import Data, at_origin, in_unit, keywords_by_site, model_keywords
+from lfm_ppl.io.data_set import Data, at_origin, keywords_by_site, model_keywords
 from lfm_ppl.io.table import is_table
 from lfm_ppl.likelihoods.handlers.approximate import complete
 from lfm_ppl.model.events import Event
@@ -37,14 +37,6 @@ class SiteData(NamedTuple):
     unit: str | None
     labelled_y: Any
 
-    @classmethod
-    def of(cls, data: Any, on_clock: Any) -> SiteData:
-        """Return the data of a site from what was passed, `Data` or (times, y), and the same on the model's clock."""
-        on_clock = on_clock if isinstance(on_clock, Data) else None
-        if isinstance(data, Data):
-            return cls(on_clock, data.units.get("time"), None)
-        return cls(on_clock, None, data[1])
-
 
 class BoundData(NamedTuple):
     """A model that is bound to its data.
@@ -52,7 +44,8 @@ class BoundData(NamedTuple):
     Attributes:
         bound: the bound model.
         series: the data by likelihood site, also of one site.
-        clock: the calendar time of t = 0 (None where times are plain numbers) with the unit of time.
+        clock: the calendar time of t = 0 (None where times are plain numbers) with the unit of time (empty where it is
+            unknown, or where sites have units of their own).
         model_kwargs: keyword arguments of the model; of one site with the known inputs of its data.
     """
 
@@ -62,60 +55,120 @@ class BoundData(NamedTuple):
     model_kwargs: Mapping[str, Any] | None
 
 
-def bind_data(numpyro_model: Callable, times: Any, y: Any, model_kwargs: Mapping[str, Any] | None) -> BoundData:
-    """Bind a model to data with dates or units, of one likelihood site or by site; arguments as `lfm_ppl.fit`."""
-    site_data = data_by_site(times, y)
-    if site_data is not None:
-        bound, on_clock, clock = bind_sites(numpyro_model, site_data, model_kwargs)
-        return BoundData(bound, {name: SiteData.of(value, on_clock[name]) for name, value in site_data.items()}, clock,
-                         model_kwargs)
-    table = as_data(times) if y is None else None
-    pair = (times, y) if table is None else (table.times, table.y)
-    bound, data, clock = bind_dates(numpyro_model, pair[0], pair[1], table, model_kwargs)
-    keywords = model_kwargs if data is None else model_keywords(data.inputs, model_kwargs)
-    return BoundData(bound, {bound.site.name: SiteData.of(times if isinstance(times, Data) else pair, data)}, clock,
-                     keywords)
+class _Record(NamedTuple):
+    """Observations of a site, with numbers as times.
 
-
-def bind_dates(numpyro_model: Callable, times: Any, y: Any, data: Data | None,
-               model_kwargs: Mapping[str, Any] | None) -> tuple[BoundModel, Data | None, tuple[str | None, str]]:
-    """Bind a model to its data.
-
-    Args:
-        numpyro_model: the model.
-        times: (T,) or (B, T), numbers or dates.
-        y: the observations, or a data frame of them.
-        data: the object that holds times and y; None where they were passed themselves.
-        model_kwargs: keyword arguments of the model, without the known inputs of ``data``.
-
-    Returns:
-        The bound model; the data, with times in the unit of the model where both have one; the calendar time of t = 0
-        (None where times are plain numbers) with the unit of time (empty where it is unknown).
+    Attributes:
+        times, y: (T,) or (B, T); the observations.
+        data: the object that holds them; None where times and y were passed themselves.
+        origin: the calendar time of t = 0; None for plain numbers.
+        unit: of the times; empty where it is unknown.
     """
-    checks.refuse_durations("times", times)
-    origin, unit = (None, "") if data is None else (data.origin, data.units.get("time", ""))
-    if calendar_time.holds_dates(times):
-        times, origin, unit = calendar_time.numbers_of("times", times)
-        date_warnings.warn_of_changed_clock("times[{}]".format, times, origin, unit)
-    elif data is None:
-        _warn_of_compact_dates("times", times)
-    values = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
 
-    def bind_in(origin: str | None, unit: str) -> BoundModel:
-        keywords = dict(model_kwargs or {}) if data is None else model_keywords(data.inputs, model_kwargs)
+    times: Any
+    y: Any
+    data: Data | None
+    origin: str | None
+    unit: str
+
+    @classmethod
+    def of(cls, value: Data | tuple[Any, Any], label: str) -> _Record:
+        """Return the record of `Data`, or of a pair of times, which may be dates, and observations."""
+        if isinstance(value, Data):
+            return cls(value.times, value.y, value, value.origin, value.units.get("time", ""))
+        times, y = value
+        y = y.to_numpy(float) if hasattr(y, "to_numpy") else y  # a data frame
+        checks.refuse_durations(label, times)
+        if not calendar_time.holds_dates(times):
+            _warn_of_compact_dates(label, times)
+            return cls(times, y, None, None, "")
+        numbers, origin, unit = calendar_time.numbers_of(label, times)
+        date_warnings.warn_of_changed_clock(f"{label}[{{}}]".format, numbers, origin, unit)
+        return cls(numbers, y, None, origin, unit)
+
+    def on_clock(self, origin: str | None, unit: str) -> _Record:
+        """Return the record with times that count from another origin in another unit; without a unit as it is."""
+        seconds, new_seconds = (calendar_time.SECONDS.get(name) for name in (self.unit, unit))
+        if seconds is None or new_seconds is None or (self.origin, seconds) == (origin, new_seconds):
+            return self
+        if self.data is not None:
+            data = at_origin(self.data, origin, unit)
+            return _Record(data.times, self.y, data, origin, unit)
+        shift = 0.0 if origin is None else float(calendar_time.positions("origin", self.origin, origin, unit))
+        return _Record(np.asarray(self.times) * (seconds / new_seconds) + shift, self.y, None, origin, unit)
+
+
+def bind_data(numpyro_model: Callable, times: Any, y: Any, model_kwargs: Mapping[str, Any] | None) -> BoundData:
+    """Bind a model to data with dates or units, of one likelihood site or by site; arguments as `lfm_ppl.fit`.
+
+    1. Dates of all sites are counted from the first one. Numbers stay.
+    2. The model is bound. It names its unit of time only once it has been built, which needs times.
+    3. Where that is another unit, times and known inputs of the data are converted, and the model is bound again.
+    """
+    passed = data_by_site(times, y)
+    is_by_site = passed is not None
+    if passed is None:
+        passed = {"": as_data(times) if y is None else (times, y)}
+    own = {name: _Record.of(value, f"times[{name!r}]" if is_by_site else "times") for name, value in passed.items()}
+    origin, unit = _common_clock(own)
+    records = own if origin is None else {name: record.on_clock(origin, unit) for name, record in own.items()}
+
+    def bind_records(records: Mapping[str, _Record], unit: str) -> BoundModel:
         with calendar_time.in_messages(origin, unit):
-            return _bind(numpyro_model, times, values, keywords)
+            return _bind(numpyro_model, records, is_by_site, model_kwargs)
 
-    bound = bind_in(origin, unit)
-    # The model names its unit only once it has been built, which needs times.
-    model_unit = bound.site.example.ssm.model.units.get("time", "")
-    data_seconds, model_seconds = (calendar_time.SECONDS.get(name) for name in (unit, model_unit))
-    if data_seconds is None or model_seconds is None or data_seconds == model_seconds:
-        return bound, data, (origin, unit)
-    _check_unit_of_inputs(model_kwargs, data, unit, model_unit)
-    times = np.asarray(times) * (data_seconds / model_seconds)
-    data = None if data is None else at_origin(data, origin, model_unit)
-    return bind_in(origin, model_unit), data, (origin, model_unit)
+    bound = bind_records(records, unit)
+    unit, converted = _in_units_of(bound, records, origin, unit)
+    if any(converted[name] is not record for name, record in records.items()):
+        for name, record in converted.items():
+            if record is not records[name]:
+                _check_unit_of_inputs(model_kwargs, records[name].data, records[name].unit, record.unit)
+        bound = bind_records(converted, unit)
+    series = {}
+    for name, record in converted.items():
+        value = passed[name]
+        unit_and_labels = (value.units.get("time"), None) if isinstance(value, Data) else (None, value[1])
+        series[name if is_by_site else bound.site.name] = SiteData(record.data, *unit_and_labels)
+    if not is_by_site and converted[""].data is not None:
+        model_kwargs = model_keywords(converted[""].data.inputs, model_kwargs)
+    return BoundData(bound, series, (origin, unit), model_kwargs)
+
+
+def _common_clock(records: Mapping[str, _Record]) -> tuple[str | None, str]:
+    """Return the first origin and the unit of the first site; None where times are numbers.
+
+    Raises:
+        ValueError: the times of some sites are dates and those of others are not, or their clocks have no common zero.
+    """
+    first = next(iter(records.values()))
+    origins = {name: record.origin for name, record in records.items()}
+    dates = [date for date in origins.values() if date is not None]
+    if not dates:
+        return None, "" if len(records) > 1 else first.unit
+    if len(dates) < len(records):
+        raise ValueError("the times of some sites are dates and the others are numbers: give dates for all sites, or "
+                         "numbers for all.")
+    calendar_time.check_offsets(origins)
+    return dates[int(np.argmin([calendar_time.positions("times", date, dates[0], first.unit) for date in dates]))], (
+        first.unit)
+
+
+def _in_units_of(bound: BoundModel, records: Mapping[str, _Record], origin: str | None,
+                 unit: str) -> tuple[str, dict[str, _Record]]:
+    """Return the unit of the clock, and records in the units of time that the models of their sites name.
+
+    Dates have one unit, the first that a model names. Where the model of a site of numbers names none, its unit is that
+    of the first record with one.
+    """
+    models = bound.site_models
+    named = {name: models.get(name, bound).site.example.ssm.model.units.get("time", "") for name in records}
+    known = [name for name in named.values() if name in calendar_time.SECONDS]
+    if origin is not None:
+        unit = known[0] if known else unit
+        return unit, {name: record.on_clock(origin, unit) for name, record in records.items()}
+    first = next((record.unit for record in records.values() if record.unit in calendar_time.SECONDS), "")
+    converted = {name: record.on_clock(None, named[name] or first) for name, record in records.items()}
+    return (next(iter(converted.values())).unit if len(records) == 1 else ""), converted
 
 
 def _warn_of_compact_dates(name: str, times: Any) -> None:
@@ -216,85 +269,17 @@ def coords_of_site(coords: Mapping[str, Any] | None, name: str, sites: Collectio
             if dim.startswith(prefix) or not dim.startswith(other_prefixes)}
 
 
-def bind_sites(numpyro_model: Callable, sites: Mapping[str, Any], model_kwargs: Mapping[str, Any] | None
-               ) -> tuple[BoundModel, dict[str, Any], tuple[str | None, str]]:
-    """Bind a model with several likelihood sites to its data, with dates of all sites on one clock.
-
-    Args:
-        numpyro_model: the model.
-        sites: name of the site -> `Data` or a pair of times and observations.
-        model_kwargs: keyword arguments of the model, without the known inputs of the data.
-
-    Returns:
-        The bound model; the data of each site, `Data` or a pair; the clock, as `bind_dates`.
-    """
-    pairs = [name for name, value in sites.items() if not isinstance(value, Data)]
-    sites = {name: _dated(*value) if name in pairs else value for name, value in sites.items()}
-    origins = [value.origin for value in sites.values() if isinstance(value, Data) and value.origin is not None]
-    if len(origins) < len(sites):
-        if origins:
-            raise ValueError("the times of some sites are dates and the others are numbers: give dates for all sites, "
-                             "or numbers for all.")
-        return *_bind_numbers(numpyro_model, sites, model_kwargs), (None, "")
-    calendar_time.check_offsets({name: value.origin for name, value in sites.items()})
-    unit = next(iter(sites.values())).units["time"]
-    origin = origins[int(np.argmin([calendar_time.positions("times", date, origins[0], unit) for date in origins]))]
-
-    def bind_in(unit: str) -> tuple[BoundModel, dict[str, Any], tuple[str | None, str]]:
-        on_clock: dict[str, Any] = {name: at_origin(value, origin, unit) for name, value in sites.items()}
-        on_clock |= {name: (on_clock[name].times, on_clock[name].y) for name in pairs}
-        with calendar_time.in_messages(origin, unit):
-            return _bind_sites(numpyro_model, on_clock, model_kwargs), on_clock, (origin, unit)
-
-    bound, data, clock = bind_in(unit)
-    # A model names its unit only once it has been built, which needs times.
-    units = [model.site.example.ssm.model.units.get("time") for model in bound.site_models.values()]
-    model_unit = next((name for name in units if name in calendar_time.SECONDS), unit)
-    return (bound, data, clock) if model_unit == unit else bind_in(model_unit)
-
-
-def _bind_numbers(numpyro_model: Callable, sites: Mapping[str, Any],
-                  model_kwargs: Mapping[str, Any] | None) -> tuple[BoundModel, dict[str, Any]]:
-    """Bind a model to sites whose times are numbers; those with a unit are converted to that of the model.
-
-    Where the model of a site names no unit, they are converted to that of the first site with one.
-    """
-    bound = _bind_sites(numpyro_model, sites, model_kwargs)
-    first = next((value.units["time"] for value in sites.values()
-                  if isinstance(value, Data) and value.units.get("time") in calendar_time.SECONDS), "")
-    units = {name: site_model.site.example.ssm.model.units.get("time", first)
-             for name, site_model in bound.site_models.items()}
-    converted = {name: in_unit(value, units[name]) if isinstance(value, Data) else value
-                 for name, value in sites.items()}
-    if all(converted[name] is value for name, value in sites.items()):
-        return bound, converted
-    return _bind_sites(numpyro_model, converted, model_kwargs), converted
-
-
-def _dated(times: Any, y: Any) -> Data | tuple[Any, Any]:
-    """Return times and observations, as `Data` where times are dates."""
-    checks.refuse_durations("times", times)
-    y = y.to_numpy(float) if hasattr(y, "to_numpy") else y
-    if not calendar_time.holds_dates(times):
-        return times, y
-    columns = np.asarray(checks.unmask(y), float).reshape(len(times), -1)
-    return Data(times, columns, tuple(map(str, range(columns.shape[1]))))
-
-
-def _bind_sites(numpyro_model: Callable, sites: Mapping[str, Any],
-                model_kwargs: Mapping[str, Any] | None) -> BoundModel:
-    pairs = {name: (value.times, value.y) if isinstance(value, Data) else value for name, value in sites.items()}
-    keywords = keywords_by_site({name: model_keywords(value.inputs, None) if isinstance(value, Data) else {}
-                                 for name, value in sites.items()})
-    times, y = ({name: pair[index] for name, pair in pairs.items()} for index in (0, 1))
-    return _bind(numpyro_model, times, y, keywords | dict(model_kwargs or {}))
-
-
-def _bind(numpyro_model: Callable, times: Any, y: Any, model_kwargs: dict[str, Any]) -> BoundModel:
+def _bind(numpyro_model: Callable, records: Mapping[str, _Record], is_by_site: bool,
+          model_kwargs: Mapping[str, Any] | None) -> BoundModel:
+    """Bind a model to records, by site or of one, with their known inputs as keyword arguments."""
+    inputs = {name: {} if record.data is None else model_keywords(record.data.inputs, None)
+              for name, record in records.items()}
+    times, y = ({name: getattr(record, field) for name, record in records.items()} for field in ("times", "y"))
+    keywords = (keywords_by_site(inputs) if is_by_site else inputs[""]) | dict(model_kwargs or {})
     try:
-        return bind(numpyro_model, times, y, **model_kwargs)
+        return bind(numpyro_model, times if is_by_site else times[""], y if is_by_site else y[""], **keywords)
     except TypeError as error:
-        if "'NoneType'" not in str(error) or "inputs" in model_kwargs or (
+        if "'NoneType'" not in str(error) or "inputs" in keywords or (
                 "inputs" not in inspect.signature(numpyro_model).parameters):
             raise
         raise TypeError("the model has an argument `inputs`, and there are none. Name their columns, "

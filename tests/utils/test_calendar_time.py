@@ -15,7 +15,7 @@ from lfm_ppl.io.data import read_csv
 from lfm_ppl.io.data_set import Data, stack_series
 from lfm_ppl.results.plots import style
 from lfm_ppl.utils import calendar_time
-from lfm_ppl.workflows.data_binding import bind_dates, bind_sites
+from lfm_ppl.workflows.data_binding import bind_data
 
 
 @pytest.mark.parametrize(("gap", "unit"), [
@@ -214,13 +214,14 @@ def test_known_inputs_have_the_unit_of_the_model_or_are_refused():
         numpyro.sample("rate", dist.LogNormal(-1.0, 0.5))
         numpyro.sample("y", lfm.MarginalLikelihood(system(units={"time": "hours"}), times), obs=y)
 
-    bound, converted, clock = bind_dates(heated, data.times, data.y, data, None)
+    bound, series, clock, _ = bind_data(heated, data, None, None)
+    converted = series["y"].on_clock
     assert bound.times.tolist() == [0.0, 24.0] and clock == (None, "hours")
     assert converted.inputs["heat"].times.tolist() == [0.0, 12.0] and converted.units["time"] == "h"
     with pytest.raises(ValueError, match="times in d, and the model counts hours"):
-        bind_dates(heated, data.times, data.y, data, {"inputs": data.known_inputs()})
+        bind_data(heated, data, None, {"inputs": data.known_inputs()})
     with pytest.warns(UserWarning, match="converted from d to hours"):
-        bind_dates(heated, data.times, data.y, data, {"inputs": {"heat": lfm.Input([0.0, 30.0], [1.0, 2.0])}})
+        bind_data(heated, data, None, {"inputs": {"heat": lfm.Input([0.0, 30.0], [1.0, 2.0])}})
 
 
 def two_sites(times, y=None):
@@ -232,14 +233,14 @@ def two_sites(times, y=None):
 def test_sites_have_the_unit_of_the_model_and_one_kind_of_clock():
     y = np.zeros((3, 1))
     sites = {"a": Data([0.0, 1.0, 2.0], y, ("x",), {"time": "d"}), "b": ([0.0, 5.0, 9.0], y)}
-    bound, data, _ = bind_sites(two_sites, sites, None)
-    assert bound.site_models["a"].times.tolist() == [0.0, 24.0, 48.0] == data["a"].times.tolist()
+    bound, data, _, _ = bind_data(two_sites, sites, None, None)
+    assert bound.site_models["a"].times.tolist() == [0.0, 24.0, 48.0] == data["a"].on_clock.times.tolist()
     assert bound.site_models["b"].times.tolist() == [0.0, 5.0, 9.0]
     for zone in ("UTC", "Asia/Tokyo"):
         mixed = {"a": (pd.DatetimeIndex(DATES), y), "b": (pd.DatetimeIndex(DATES, tz=zone), y)}
         for order in (["a", "b"], ["b", "a"]):
             with pytest.raises(ValueError, match="'b' have an offset from UTC, and the times of 'a' have none"):
-                bind_sites(two_sites, {name: mixed[name] for name in order}, None)
+                bind_data(two_sites, {name: mixed[name] for name in order}, None, None)
 
 
 def test_series_with_and_without_an_offset_are_not_stacked():
@@ -251,7 +252,7 @@ def test_series_with_and_without_an_offset_are_not_stacked():
 
 def test_compact_dates_in_an_array_are_named():
     with pytest.warns(UserWarning, match="20260130 .*plain numbers"):
-        bind_dates(model, np.array([20260130, 20260131, 20260201]), np.zeros((3, 1)), None, None)
+        bind_data(model, np.array([20260130, 20260131, 20260201]), np.zeros((3, 1)), None)
     for cells in ([20260130, 20260231], [20260130, 2026013106], ["20260130", ""], [20260130.5], []):
         assert calendar_time.compact_dates(cells) is None
     assert calendar_time.compact_dates([20260130.0, "20260131"])[1].day == 31
