@@ -42,8 +42,8 @@ import numpy as np
 import pandas as pd
 
 import lfm_ppl as lfm
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.counts import experiment, figures, problem
+from lfm_ppl.studies import scores
+from lfm_ppl.studies.counts import figures, problem, study
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
@@ -73,11 +73,11 @@ print(f"log Z by EP: {float(likelihood.log_prob(y)):.4f}")
 # %%
 shared = Path(os.environ.get("LFM_DATA", "../shared/data"))
 data = str(shared) if (shared / problem.EVENTS).is_file() and not quick else None
-settings = experiment.CountsSettings.quick() if quick else experiment.CountsSettings(
+settings = study.CountsSettings.quick() if quick else study.CountsSettings(
     data=data, problems=(problem.COAL, *problem.SIMULATED))
 # The folder of an earlier run with these settings; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/counts"))
-result = experiment.STUDY.run(settings, folder)
+result = study.STUDY.run(settings, folder)
 print("real disasters" if data else "simulated disasters")
 
 # %% [markdown]
