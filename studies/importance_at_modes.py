@@ -18,8 +18,9 @@ import numpy as np
 from scipy import special, stats
 
 from lfm_ppl.accuracy import importance_weights
-from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import Minimum
+
+from .log_posterior import LogPosterior
 
 FREEDOM = (3, 5)
 """Degrees of freedom of the first and the second t distribution."""

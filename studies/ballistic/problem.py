@@ -22,8 +22,9 @@ import numpy as np
 from numpyro import handlers
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.io import loading
+
+from ..log_posterior import LogPosterior
 
 NAMES = ("alpha", "scale", "lengthscale")
 """Unknown parameters: the drag, and two parameters of the force. All computations use their logarithms z."""

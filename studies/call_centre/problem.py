@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.io import loading
 from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 
+from ..log_posterior import LogPosterior
 from . import counts
 from .counts import BIN, COUNTS_PER_DAY, DAY, CallCounts
 

@@ -30,11 +30,11 @@ from scipy.optimize import minimize_scalar
 import lfm_ppl as lfm
 from lfm_ppl.constrained.full_information import ConstrainedEstimate
 from lfm_ppl.constrained.posterior import ConstrainedPosterior
-from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import newton, quasi_newton
 from lfm_ppl.parallel.task import Result, Task
 
 from ..importance_at_modes import weighted_posterior
+from ..log_posterior import LogPosterior
 from ..scores import Z, interval_coverage, rmse
 from ..tasks import dataset_indices
 from . import problem

@@ -24,9 +24,10 @@ from scipy.signal import lfilter
 
 import lfm_ppl as lfm
 from lfm_ppl.forces import Matern
-from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.io import loading
 from lfm_ppl.likelihoods.likelihood_site import likelihood_site
+
+from ..log_posterior import LogPosterior
 
 MAX_DATA_SETS = 10_000
 """Largest number of records of a shape, targets or patients for one seed of the study."""

@@ -24,13 +24,13 @@ from scipy.stats import norm
 
 import lfm_ppl as lfm
 from lfm_ppl.inference.bind import bind_arguments
-from lfm_ppl.inference.log_posterior import LogPosterior
 from lfm_ppl.inference.optimise import quasi_newton
 from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.switching.mixture import Mixture
 from lfm_ppl.switching.rao_blackwellised import RaoBlackwellisedResult
 
 from .. import chains, scores, timing
+from ..log_posterior import LogPosterior
 from ..tasks import stack_results
 from . import problem
 from .problem import FINE, TIMES, TRAIN, Model, Window

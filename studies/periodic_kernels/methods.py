@@ -10,13 +10,15 @@ import numpy as np
 from scipy.stats import norm
 
 from lfm_ppl import forces
-from lfm_ppl.forces import Force, PeriodicCovariance, random_frequencies
+from lfm_ppl.forces import Force, PeriodicCovariance
 from lfm_ppl.parallel.task import Result, Task
 
 from .. import scores
 from ..tasks import stack_results
 from . import problem
 from .problem import MEASURED, PREDICTED
+from .resonators import resonators
+from .sparse_spectrum import SparseSpectrum, random_frequencies
 
 EIGENFUNCTIONS, RESONATORS, RANDOM = METHODS = ("eigenfunctions", "resonators", "sparse spectrum")
 """Methods whose covariance functions are compared for each number of functions."""
@@ -45,7 +47,7 @@ def covariance_errors(task: Task) -> Result:
                "left out": np.mean(np.diag(exact) - force.sde_covariance(times, times))}
         if kernel.stationary:
             # Without noise and damping a resonator's covariance depends on the distance in time alone.
-            covariance = forces.resonators(kernel, count, explained_variance=0.0).covariance(times)
+            covariance = resonators(kernel, count, explained_variance=0.0).covariance(times)
             row[RESONATORS] = np.abs(covariance - exact[:, 0]).max()
         if spectrum is not None:
             frequencies = random_frequencies(jax.random.fold_in(task.key, count), spectrum, size * draws)
@@ -122,7 +124,7 @@ def predict_functions(task: Task) -> Result:
 def approximation(method: str, key: jax.Array) -> Force:
     """Return the force of a method; a sparse spectrum has random frequencies."""
     if "sparse" in method:
-        return forces.SparseSpectrum(1.0, random_frequencies(key, problem.window_prior(), PREDICTORS[method]))
+        return SparseSpectrum(1.0, random_frequencies(key, problem.window_prior(), PREDICTORS[method]))
     return eigenfunctions(problem.window_kernel(), PREDICTORS[method], 20 if method == COARSE else 200)
 
 

@@ -9,12 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from lfm_ppl.forces import Force, Matern, PeriodicCovariance, SquaredExponential
 from lfm_ppl.forces.basis import Waves, fourier_coefficients
-from lfm_ppl.forces.matern import Matern
 from lfm_ppl.forces.parameters import Mean, mean_parameter, positive_parameter
-from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
-from lfm_ppl.forces.sde import Force
-from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.utils import checks
 
 _HARMONICS = 512

@@ -10,7 +10,7 @@ from scipy import stats
 
 import lfm_ppl as lfm
 from lfm_ppl.inference.bind import bind_arguments
-from lfm_ppl.inference.log_posterior import LogPosterior
+from lfm_ppl.studies.log_posterior import LogPosterior
 
 TIMES = np.array([0.0, 0.7, 1.1, 2.0])
 SETS = [(jnp.array([[0.4], [0.8], [jnp.nan], [0.7]]) * factor, {"shift": jnp.asarray(factor)}) for factor in (1.0, 2.0)]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.inference.bound_model import BoundModel
+import lfm_ppl as lfm
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.utils.programs import Program
@@ -33,7 +33,7 @@ class LogPosterior:
         ValueError: other names than the model's; a parameter that is not positive.
     """
 
-    def __init__(self, bound: BoundModel, names: Sequence[str], forward_mode: bool | None = None) -> None:
+    def __init__(self, bound: lfm.BoundModel, names: Sequence[str], forward_mode: bool | None = None) -> None:
         self.bound, self.names = bound, tuple(names)
         if sorted(names) != sorted(bound.names):
             raise ValueError(f"names must be the model's parameters, in any order: {', '.join(bound.names)}; got "

@@ -5,13 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from lfm_ppl.forces import Constant, PeriodicCovariance, Resonator, Sum
 from lfm_ppl.forces.basis import Waves
-from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.parameters import Mean, non_negative_parameter
-from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
 from lfm_ppl.forces.quasi_periodic import EXPLAINED_VARIANCE, stationary_basis, warn_of_lost_variance
-from lfm_ppl.forces.resonator import Resonator
-from lfm_ppl.forces.sde import Sum
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import safe_sqrt
 
