@@ -17,26 +17,25 @@ PACKAGE = ROOT / "lfm_ppl"
 # Lower layers first. A module belongs to the longest name here that is a prefix of its own, and may
 # import from its own layer and from the layers below.
 LAYERS = (
-    ("utils", "io.table"),
+    ("utils",),
     ("forces",),
     ("linearisation",),
     ("model",),
     ("orbits", "io", "space"),
     ("filtering",),
     ("particles", "fokker_planck_grid", "latent_grid", "constrained"),
-    ("switching",),
     ("likelihoods",),
-    ("switching.switching_likelihood",),
+    ("switching",),
     ("inference",),
     ("orbits.training", "orbits.learning", "orbits.prediction"),
     ("results", "accuracy", "parallel"),
     ("workflows",),
-    ("io.loading",),
+    ("",),  # the public API
     ("studies",),
     ("cli", "__main__"),
 )
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
-PUBLIC = "lfm_ppl"  # the public API stands above the library and below the command line
+PUBLIC = "lfm_ppl"
 MODULES = {".".join(path.relative_to(root).with_suffix("").parts).removesuffix("__init__").removesuffix("."): path
            for root, folder in ((ROOT, ROOT / "studies"), (PACKAGE, PACKAGE)) for path in sorted(folder.rglob("*.py"))}
 """Name below the package, such as ``forces.matern``, -> file; ``studies/`` is the package ``lfm_ppl.studies``."""
@@ -69,9 +68,7 @@ def imports_of(module: str) -> list[tuple[int, str, str]]:
 
 
 def rank(module: str) -> int:
-    """Return the layer of a module named below the package; the public API stands below those that may import it."""
-    if not module:
-        return RANK["io.loading"]
+    """Return the layer of a module named below the package."""
     parts = module.split(".")
     return next((RANK[name] for length in range(len(parts), 0, -1)
                  if (name := ".".join(parts[:length])) in RANK), len(LAYERS))
