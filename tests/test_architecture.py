@@ -27,6 +27,7 @@ LAYERS = (
     ("likelihoods",),
     ("switching",),
     ("inference",),
+    ("storage",),
     ("orbits.training", "orbits.learning", "orbits.prediction"),
     ("results", "accuracy", "parallel"),
     ("workflows",),

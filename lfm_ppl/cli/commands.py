@@ -225,7 +225,8 @@ def _default(value: Any) -> str:
 def plot(result: Result, /, *, options: PlotOptions = PlotOptions()) -> None:
     """Draw the figures of a saved result again."""
     from lfm_ppl.cli.folders import check_writable
-    from lfm_ppl.results import arviz_data, files, plots
+    from lfm_ppl.results import arviz_data, plots
+    from lfm_ppl.storage import files
 
     path = files.locate(result)
     target = Path(options.out) if options.out else path.parent

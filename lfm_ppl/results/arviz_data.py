@@ -20,8 +20,9 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl.results import convergence, files, netcdf
+from lfm_ppl.results import convergence, netcdf
 from lfm_ppl.results.scalars import scalar_draws, scalar_truth
+from lfm_ppl.storage import files
 
 LIBRARY = "lfm_ppl"
 

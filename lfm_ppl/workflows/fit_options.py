@@ -18,7 +18,7 @@ from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.likelihoods.priors import assumptions, prior_interval, without_parameters
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
-from lfm_ppl.results import run_record
+from lfm_ppl.storage import run_record
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.random_keys import split_by_name
 

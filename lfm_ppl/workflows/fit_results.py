@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field
 from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -33,12 +34,13 @@ from lfm_ppl.inference.trajectories import evenly_spaced, scores, trajectories
 from lfm_ppl.io.data_set import Data
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.checkpoint import Checkpoint
-from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, TrajectoryDraws, force_periods, lay_out
 from lfm_ppl.results.predictions import SHOWN_PERIODS, repeats_often
 from lfm_ppl.results.sites import merge_sites
+from lfm_ppl.storage.checkpoint import Checkpoint, is_finished
+from lfm_ppl.storage.files import POSTERIOR
+from lfm_ppl.storage.run_record import check_same
 from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
 from lfm_ppl.utils.random_keys import split_by_name
@@ -354,3 +356,21 @@ def note_warnings(result: Any, likelihood_warnings: Sequence[str] = ()) -> list[
     convergence_warnings = arviz_data.convergence_warnings(result)
     result.attrs["warnings"] = json.dumps([*convergence_warnings, *likelihood_warnings])
     return convergence_warnings
+
+
+def finished_result(folder: str | Path, record: Mapping[str, Any]) -> Any:
+    """Return the result of a finished run; None for an unfinished one.
+
+    Raises:
+        ValueError: it is the result of another run; the message lists the differences.
+    """
+    path = Path(folder) / POSTERIOR
+    if not is_finished(folder):
+        return None
+    result = arviz_data.load(path)
+    run = arviz_data.attributes(result).get("run")
+    if not isinstance(run, Mapping):
+        raise ValueError(f"{path} has no record of its run, which cannot be resumed. Start a new run in another "
+                         "folder.")
+    check_same(folder, run, record)
+    return result

@@ -5,7 +5,7 @@
    or the new file.
 3. `RunStore.get` returns them. A resumed run computes only the missing names.
 
-Chains (`lfm_ppl.results.checkpoint`), batches of draws and tasks (`lfm_ppl.parallel`) use this store.
+Chains (`lfm_ppl.storage.checkpoint`), batches of draws and tasks (`lfm_ppl.parallel`) use this store.
 """
 
 from __future__ import annotations

@@ -28,11 +28,10 @@ from typing import Any
 import numpy as np
 
 from lfm_ppl.inference.sampling import Saved
-from lfm_ppl.results import arviz_data
-from lfm_ppl.results.files import CHECKPOINT, POSTERIOR
-from lfm_ppl.results.run_record import as_json, check_same
+from lfm_ppl.storage.files import CHECKPOINT, POSTERIOR
+from lfm_ppl.storage.run_record import as_json, check_same
+from lfm_ppl.storage.run_store import DamagedFileError, RunStore
 from lfm_ppl.utils.atomic_files import atomic_write
-from lfm_ppl.utils.run_store import DamagedFileError, RunStore
 
 _RUN, _SETUP, _STATE = "run.json", "setup", "state"
 
@@ -271,24 +270,6 @@ def remove_run(folder: str | Path) -> None:
     shutil.rmtree(Path(folder) / CHECKPOINT, ignore_errors=True)
     with contextlib.suppress(OSError):  # the folder is not empty
         Path(folder).rmdir()
-
-
-def finished_result(folder: str | Path, record: Mapping[str, Any]) -> Any:
-    """Return the result of a finished run; None for an unfinished one.
-
-    Raises:
-        ValueError: it is the result of another run; the message lists the differences.
-    """
-    path = Path(folder) / POSTERIOR
-    if not is_finished(folder):
-        return None
-    result = arviz_data.load(path)
-    run = arviz_data.attributes(result).get("run")
-    if not isinstance(run, Mapping):
-        raise ValueError(f"{path} has no record of its run, which cannot be resumed. Start a new run in another "
-                         "folder.")
-    check_same(folder, run, record)
-    return result
 
 
 def begin_or_resume(folder: str | Path, record: Mapping[str, Any], resume: bool) -> Checkpoint:
