@@ -9,7 +9,7 @@ from .constrained.moving_horizon import MovingHorizon as MovingHorizon
 from .constrained.moving_horizon import moving_horizon as moving_horizon
 from .constrained.posterior import constrained_posterior as constrained_posterior
 from .filtering.breakdown import FilterWarning as FilterWarning
-from .filtering.ep.settings import SiteSettings as SiteSettings
+from .filtering.ep.settings import FactorSettings as FactorSettings
 from .filtering.filter import FilterState as FilterState
 from .filtering.filter import filter as filter
 from .filtering.smoother import smooth as smooth

@@ -9,14 +9,14 @@
 # ---
 
 # %% [markdown]
-# # Counts, gross errors, yes and no: how good are sites?
+# # Counts, gross errors, yes and no: how good are Gaussian factors?
 #
 # $$f(t) = \text{level} + u(t), \qquad y_k \sim p(\cdot \mid f(t_k)).$$
 #
 # Only `observation=` of a model says what its data are. A family beyond the Gaussian has no closed likelihood, and the
-# filter takes a Gaussian site in the place of each value. `sites=` says how sites are refined: expectation propagation
-# (EP, the default), variational, or Laplace. Here each is held against exact sampling of the same posterior, with the
-# parameters held fixed:
+# filter takes a Gaussian factor in the place of each value. `factors=` says how factors are refined: expectation
+# propagation (EP, the default), variational, or Laplace. Here each is held against exact sampling of the same
+# posterior, with the parameters held fixed:
 #
 # - disasters in British coal mines, 1851 to 1962, in 333 bins of four months (Poisson);
 # - 200 simulated answers of yes or no;

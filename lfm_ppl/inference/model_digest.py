@@ -112,7 +112,7 @@ class _record_values(LikelihoodHandler):  # noqa: N801 (an effect handler, named
             self.settings += repr((distribution.regime_names, distribution.max_step, distribution.merging))
         else:
             self.settings += repr((distribution.max_step, distribution.iterations, distribution.damping,
-                                   distribution.tolerance, distribution.method, distribution.sites))
+                                   distribution.tolerance, distribution.method, distribution.factors))
         return super().replacement(likelihood, site)
 
     def _values(self, ssm: StateSpaceModel) -> list[Any]:

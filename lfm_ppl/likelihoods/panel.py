@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
 from lfm_ppl.filtering.arguments import as_rule
-from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD
 from lfm_ppl.filtering.stiffness import long_step_message, warn_of_message
 from lfm_ppl.likelihoods.constrained_likelihood import likelihood_with
@@ -200,7 +200,7 @@ class Panel(Likelihood):
 
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayLike, rule: Rule | None = None,
           steps: int = 10, max_step: float | None = None, iterations: int | None = None, damping: float = 0.7,
-          tolerance: float | None = None, sites: SiteSettings | str | None = None,
+          tolerance: float | None = None, factors: FactorSettings | str | None = None,
           method: str = DEFAULT_METHOD) -> Panel:
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.
 
@@ -217,7 +217,7 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         iterations: of posterior linearisation; by default 3 for models that are not linear, see `MarginalLikelihood`.
         damping: largest share of each new iterate that is taken; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations; None for equal steps.
-        sites: of an observation family.
+        factors: of an observation family.
         method: of integration.
 
     Returns:
@@ -237,5 +237,5 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         (2,)
     """
     settings = {"rule": as_rule(rule), "steps": steps, "max_step": max_step, "iterations": iterations,
-                "damping": damping, "tolerance": tolerance, "sites": sites, "method": method}
+                "damping": damping, "tolerance": tolerance, "factors": factors, "method": method}
     return Panel(build, parameters, times, settings)

@@ -23,7 +23,7 @@ from numpyro.primitives import _PYRO_STACK
 from lfm_ppl.filtering.arguments import as_rule, check_observations, warn_single_precision
 from lfm_ppl.filtering.breakdown import warn_of_breakdown, warn_of_iterations
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
-from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.filtering.filter import FilterResult, filter_on
 from lfm_ppl.filtering.forward import forward
 from lfm_ppl.filtering.grid_layout import GridLayout
@@ -68,7 +68,7 @@ class SeriesLikelihood(Likelihood):
     damping: float = 0.7
     tolerance: float | None = None
     method: str = DEFAULT_METHOD
-    sites: SiteSettings | None = None
+    factors: FactorSettings | None = None
     layout: GridLayout | None = None
     regime_names: tuple[str, ...] = ()
 
@@ -165,8 +165,8 @@ class SeriesLikelihood(Likelihood):
         return True
 
     @property
-    def has_sites(self) -> bool:
-        """Whether Gaussian sites approximate factors of the density."""
+    def has_factors(self) -> bool:
+        """Whether Gaussian factors approximate terms of the density."""
         return self.is_family
 
     @property
@@ -186,12 +186,12 @@ class SeriesLikelihood(Likelihood):
                 "tolerance": self.tolerance, "method": None if self.method == DEFAULT_METHOD else self.method}
 
     @property
-    def site_settings(self) -> SiteSettings:
-        """Settings of the sites of an observation family."""
-        return SiteSettings()
+    def factor_settings(self) -> FactorSettings:
+        """Settings of the factors of an observation family."""
+        return FactorSettings()
 
     @property
-    def sites_in_words(self) -> str:
+    def factors_in_words(self) -> str:
         """Approximation of an observation family; empty for a Gaussian observation."""
         return ""
 
@@ -279,7 +279,7 @@ class SeriesLikelihood(Likelihood):
             steps: integration steps between two consecutive times; None: `steps` of the distribution.
         """
         grid, y = self.smoother_grid(at, steps), self.checked(y)
-        result = smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.site_settings)
+        result = smooth_on(self.ssm, self.rule, grid, y, self.iterations, self.damping, self.factor_settings)
         if not self.is_family:
             warn_of_iterations(result.change, result.log_likelihood_change)
         warn_of_long_steps(self.ssm, self.rule, grid, self.steps if steps is None else steps,
@@ -331,7 +331,7 @@ class SeriesLikelihood(Likelihood):
         return smoothed.entry_leave_one_out
 
     def convergence(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return whether the sites converge, and whether the log density is finite."""
+        """Return whether the factors converge, and whether the log density is finite."""
         raise NotImplementedError
 
     def checked(self, y: Any) -> jax.Array:

@@ -53,7 +53,7 @@ _DIAGNOSTICS = ["mcse_mean", "ess_bulk", "ess_tail", "r_hat"]
 
 _NOT_SETTINGS = ("model", "model_file", "description", "data", "note", "warnings", "partial", "settings", "run",
                  "map_converged", arviz_data.MODE, "command_line", "call", ORIGIN, "priors", "meanings", "assumptions",
-                 "inference_library", arviz_data.SITES, arviz_data.WEIGHTS, arviz_data.DEGENERATE)
+                 "inference_library", arviz_data.FACTORS, arviz_data.WEIGHTS, arviz_data.DEGENERATE)
 """Attributes that stand in other sections, or that only programs read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"

@@ -38,7 +38,7 @@ def digest(*values: Any) -> str:
 
 _DIGEST = "sha256:"
 
-_MODEL_SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance", "method", "constraints", "sites",
+_MODEL_SETTINGS = ("rule", "steps", "max_step", "iterations", "tolerance", "method", "constraints", "factors",
                    "fixed")
 """Entries of a record that the digest of the model depends on."""
 

@@ -243,7 +243,7 @@ class Switching(SeriesLikelihood):
         return filter_regimes(self.regimes(), y).log_likelihood[jnp.asarray(self.time_grid.observed)]
 
     def convergence(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return whether sites converge, of which there are none, and whether the log density is finite."""
+        """Return whether factors converge, of which there are none, and whether the log density is finite."""
         return jnp.asarray(True), jnp.isfinite(self._one_step_ahead(y).sum())
 
     def filter(self, y: Any) -> Any:

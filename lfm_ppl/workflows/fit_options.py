@@ -111,7 +111,7 @@ def likelihood_settings(example: SeriesLikelihood) -> dict[str, Any]:
     """Return the attributes of a result on the likelihood of one site."""
     return {
         **example.recorded_settings, "likelihood": example.description,
-        **({"sites": example.sites_in_words} if example.sites_in_words else {}),
+        **({"factors": example.factors_in_words} if example.factors_in_words else {}),
         **({"constraints": example.constraints_in_words} if example.constraints_in_words else {}),
     }  # fmt: skip
 

@@ -1,8 +1,8 @@
 """Post-processing of the draws of `lfm_ppl.fit`, and the result.
 
 1. Score the observations under every draw, and replicate them.
-2. Diagnose the likelihood: convergence of the sites, weights under constraints, resolution of the forces, and the error
-   of the Gaussian approximation.
+2. Diagnose the likelihood: convergence of the factors, weights under constraints, resolution of the forces, and the
+   error of the Gaussian approximation.
 3. Draw a trajectory for some draws of each chain.
 4. Lay out parameters, statistics, scores and trajectories as an ArviZ object with the attributes of the run.
 
@@ -28,8 +28,8 @@ import numpy as np
 from lfm_ppl.accuracy.approximation import approximation_warnings, resolution_warnings
 from lfm_ppl.accuracy.prior_conflict import prior_conflicts
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.factor_failures import factor_failures, failures_at, path_ess
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS
-from lfm_ppl.inference.site_failures import failures_at, path_ess, site_failures
 from lfm_ppl.inference.trajectories import evenly_spaced, scores, trajectories
 from lfm_ppl.io.data_set import Data
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -201,7 +201,7 @@ def _log_likelihood(bound: BoundModel, scores: Any) -> np.ndarray | None:
 
 
 def _site_attributes(problem: FitProblem, draws: PosteriorDraws, values: Mapping[str, Any]) -> dict[str, str]:
-    """Return attributes on the convergence of the sites and on the weights of constrained trajectories.
+    """Return attributes on the convergence of the factors and on the weights of constrained trajectories.
 
     Of several likelihood sites the one with the most failures, or the least weights, is reported.
     """
@@ -210,15 +210,15 @@ def _site_attributes(problem: FitProblem, draws: PosteriorDraws, values: Mapping
     for bound in (site.bound for site in problem.sites.values()):
         count_failures = None
         if options.sampler in GAUSSIAN_FILTER_SAMPLERS and z is not None:
-            count_failures = partial(site_failures, bound, z, options.seed)
+            count_failures = partial(factor_failures, bound, z, options.seed)
         elif options.sampler == "map" and bound.site.example.constraints_in_words:
             count_failures = partial(failures_at, bound, values)
         if count_failures is not None:
-            failures.append(best_effort("convergence of the sites", count_failures, None))
+            failures.append(best_effort("convergence of the factors", count_failures, None))
         weights.append(best_effort("weights under the constraints", partial(path_ess, bound, values), None))
     reports: dict[str, Any] = {
-        arviz_data.SITES: max(filter(None, failures), key=lambda report: report.unconverged + report.impossible,
-                              default=None),
+        arviz_data.FACTORS: max(filter(None, failures), key=lambda report: report.unconverged + report.impossible,
+                                default=None),
         arviz_data.WEIGHTS: min(filter(None, weights), key=lambda report: report.least, default=None)}
     return {name: json.dumps(astuple(report)) for name, report in reports.items() if report is not None}
 

@@ -43,7 +43,7 @@ def run_gaussian(task: Task) -> Result:
 
 @functools.cache
 def _gaussian_programs(rule: str) -> tuple[Callable, Callable]:
-    """Return filter and smoother with the likelihood's steps, iterations and sites, compiled for all targets."""
+    """Return filter and smoother with the likelihood's steps, iterations and factors, compiled for all targets."""
     likelihood = copy.copy(true_likelihood())
     likelihood.rule = RULES[rule]
 

@@ -2,7 +2,7 @@
 
 1. Learn the parameters once by maximising the posterior density with the evidence of expectation propagation, or take
    the true ones (`learn_parameters`). All methods use the same parameters.
-2. Approximate the posterior of the predictor by Gaussian sites: expectation propagation, variational, or Laplace.
+2. Approximate the posterior of the predictor by Gaussian factors: expectation propagation, variational, or Laplace.
 3. Sample it exactly for reference: importance sampling for the evidence, elliptical slices for the moments.
 4. Hold out each fold in turn, and score its data under the predictive distribution given the other folds.
 5. Compare every method with the reference (`compare_methods`).
@@ -34,7 +34,7 @@ from .reference import CHAINS, MonteCarloReference
 REFERENCE = "reference"
 
 METHODS = {"ep": "EP", "variational": "variational", "laplace": "Laplace", REFERENCE: REFERENCE}
-"""Method of `lfm_ppl.SiteSettings`, or the reference -> label in the tables."""
+"""Method of `lfm_ppl.FactorSettings`, or the reference -> label in the tables."""
 
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(60)
 """Quadrature rule for integrals over the predictor."""
@@ -63,7 +63,7 @@ def apply_method(task: Task) -> Result:
         error; ``share``, the effective sample size of importance sampling as a share of the draws; and the smallest
         ``ess`` and the largest ``r_hat`` over 40 rows.
     """
-    method = _apply_reference if task.settings["method"] == REFERENCE else _apply_sites
+    method = _apply_reference if task.settings["method"] == REFERENCE else _apply_factors
     return method(task, _build_task_problem(task), dict(task.settings["parameters"]))
 
 
@@ -72,11 +72,11 @@ def _build_task_problem(task: Task) -> CountsProblem:
     return build_problem(settings["problem"], ProblemSize(*settings["size"]), task.seed, settings["data"])
 
 
-def _apply_sites(task: Task, problem: CountsProblem, parameters: dict[str, float]) -> Result:
-    settings = problem.sites._replace(method=task.settings["method"])
+def _apply_factors(task: Task, problem: CountsProblem, parameters: dict[str, float]) -> Result:
+    settings = problem.factors._replace(method=task.settings["method"])
 
     def likelihood(values: dict[str, Any]) -> lfm.MarginalLikelihood:
-        return lfm.MarginalLikelihood(problem.build_model(**values), problem.times, sites=settings)
+        return lfm.MarginalLikelihood(problem.build_model(**values), problem.times, factors=settings)
 
     evidence = jax.jit(jax.value_and_grad(lambda values, y: likelihood(values).log_prob(y)))
 
@@ -92,7 +92,7 @@ def _apply_sites(task: Task, problem: CountsProblem, parameters: dict[str, float
         return jax.vmap(row)(result.mean, result.covariance, jnp.asarray(problem.times))
 
     def moments(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return means and sds (T,); NaN where the sites did not converge, which gives variances of zero or less."""
+        """Return means and sds (T,); NaN where the factors did not converge, which gives variances of zero or less."""
         mean, variance = map(np.asarray, smooth_predictor(parameters, y))
         return np.where(variance > 0, mean, np.nan), np.sqrt(np.where(variance > 0, variance, np.nan))
 
@@ -110,7 +110,7 @@ def _apply_sites(task: Task, problem: CountsProblem, parameters: dict[str, float
 
 def _apply_reference(task: Task, problem: CountsProblem, parameters: dict[str, float]) -> Result:
     draws = task.settings["draws"]
-    reference = MonteCarloReference(problem.build_model(**parameters), problem.times, problem.sites)
+    reference = MonteCarloReference(problem.build_model(**parameters), problem.times, problem.factors)
     keys = split_by_name(task.key, ("sampler", "weights", "folds"))
 
     def sample(key: jax.Array, y: np.ndarray, draws: int) -> np.ndarray:
@@ -176,7 +176,7 @@ def compare_methods(settings: Any, data: Data, name: str) -> xr.Dataset:
         Differences from the reference are NaN for the reference itself.
     """
     problem = build_problem(name, settings.size, settings.seed, settings.data)
-    # Remove the padding of shorter data. Remaining NaN show sites that did not converge, and must stay visible.
+    # Remove the padding of shorter data. Remaining NaN show factors that did not converge, and must stay visible.
     results = data["comparison"].sel(problem=name, drop=True).isel({DATASET: slice(len(problem.times))})
     results = results.assign(times=(DATASET, problem.times), y=(DATASET, problem.y[:, 0]))
     reference = results.sel({"method": REFERENCE}, drop=True)

@@ -73,7 +73,7 @@ class CountsProblem:
         priors: parameter -> prior, in the order of the table.
         true_parameters: parameters of simulated data; None if the parameters are learnt.
         truth: true predictor (T,); None if unknown.
-        sites: site settings of all methods. Near outliers, undamped site updates diverge.
+        factors: factor settings of all methods. Near outliers, undamped factor updates diverge.
     """
 
     times: np.ndarray
@@ -83,7 +83,7 @@ class CountsProblem:
     priors: Mapping[str, dist.Distribution]
     true_parameters: Mapping[str, float] | None = None
     truth: np.ndarray | None = None
-    sites: lfm.SiteSettings = lfm.SiteSettings()
+    factors: lfm.FactorSettings = lfm.FactorSettings()
 
     def model(self, times: Any, y: Any = None) -> None:
         """Sample the parameters and condition on the data: a NumPyro model."""
@@ -168,12 +168,12 @@ def _build_simulated(name: str, size: ProblemSize, seed: int) -> CountsProblem:
                                     lambda h, noise: lfm.StudentTObservation(h, 4.0, noise))
     key = jax.random.fold_in(jax.random.key(seed), NAMES.index(name))
     simulation = lfm.simulate(key, build_model(**parameters), times)
-    y, sites = np.array(simulation.y), lfm.SiteSettings()
+    y, factors = np.array(simulation.y), lfm.FactorSettings()
     if name == "student-t":
         y[OUTLIER_SPACING // 2::OUTLIER_SPACING] += OUTLIER
-        sites = lfm.SiteSettings(damping=0.5, sweeps=2000)
+        factors = lfm.FactorSettings(damping=0.5, sweeps=2000)
     priors = {"level": dist.Normal(0.0, 1.0), "scale": dist.LogNormal(0.0, 0.5),
               "lengthscale": dist.LogNormal(0.3, 0.5), "noise": dist.LogNormal(-1.6, 0.5)}
     folds = _assign_folds(size.rows, size.folds, 1, [seed, NAMES.index(name)])
     return CountsProblem(times, y, folds, build_model, {key: priors[key] for key in parameters}, parameters,
-                         np.asarray(simulation.forces["u"]), sites)
+                         np.asarray(simulation.forces["u"]), factors)

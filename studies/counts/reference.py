@@ -29,21 +29,21 @@ WARMUP = 100
 class MonteCarloReference:
     r"""Exact posterior of the predictor f = m + L w at the data, with w standard normal and L L' the prior covariance.
 
-    Two samplers use N(w; a, P^-1), the posterior in which the sites of expectation propagation replace the likelihood.
+    Two samplers use N(w; a, P^-1), the posterior in which factors of expectation propagation replace the likelihood.
     Importance sampling from it gives the evidence. Elliptical slice sampling with it as the prior (generalised
-    elliptical slice sampling) gives the posterior. Both are exact for any sites.
+    elliptical slice sampling) gives the posterior. Both are exact for any factors.
 
     Args:
         model: model without dynamics, whose predictor is a level plus the sum of the forces.
         times: times (T,).
-        sites: site settings.
+        factors: factor settings.
 
     Source: Nishihara, Murray and Adams (2014), Journal of Machine Learning Research 15.
     """
 
-    def __init__(self, model: lfm.LatentForceModel, times: np.ndarray, sites: lfm.SiteSettings) -> None:
+    def __init__(self, model: lfm.LatentForceModel, times: np.ndarray, factors: lfm.FactorSettings) -> None:
         assert isinstance(model.observation, lfm.ObservationFamily)
-        self.ssm, self.times, self.settings, self.family = lfm.state_space(model), times, sites, model.observation
+        self.ssm, self.times, self.settings, self.family = lfm.state_space(model), times, factors, model.observation
         t, zero_forces = jnp.asarray(times), jnp.zeros(len(model.force_names))
         self.mean = model.observation.function(jnp.zeros(0), zero_forces, t[0])[0]
         covariance: Any = sum(force.covariance_in_model(t[:, None], t, t[0]) for force in self.ssm.stack.forces)
@@ -54,10 +54,10 @@ class MonteCarloReference:
     def proposal(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the mean a (T,) and the factor R of the precision P = R R' for data (T, 1)."""
         problem = filter_problem(self.ssm, as_rule(None), build_time_grid(self.ssm, self.times, 1))
-        sites = evidence(problem, FamilyTerms(self.family, y), self.settings).refined.fixed_point.sites
-        nu, tau = (jnp.where(jnp.isfinite(y), a, 0.0)[:, 0] for a in (sites.nu, sites.tau))
+        factors = evidence(problem, FamilyTerms(self.family, y), self.settings).refined.fixed_point.factors
+        nu, tau = (jnp.where(jnp.isfinite(y), a, 0.0)[:, 0] for a in (factors.nu, factors.tau))
         root = jnp.linalg.cholesky(jnp.eye(len(y)) + self.root.T @ (tau[:, None] * self.root))
-        return cho_solve((root, True), self.root.T @ (nu + tau * (sites.centre[:, 0] - self.mean))), root
+        return cho_solve((root, True), self.root.T @ (nu + tau * (factors.centre[:, 0] - self.mean))), root
 
     @partial(jax.jit, static_argnums=(0, 4))
     def log_weights(self, key: jax.Array, y: jax.Array, proposal: tuple, draws: int) -> jax.Array:

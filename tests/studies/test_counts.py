@@ -1,4 +1,4 @@
-"""Sites against exact draws as a study: its data, settings and tables."""
+"""Factors against exact draws as a study: its data, settings and tables."""
 
 import os
 from pathlib import Path
@@ -78,7 +78,7 @@ def test_moments_of_the_simulated_data_are_exact_but_for_the_mark(name):
     model = data.build_model(**data.true_parameters)
     posterior = reference.MonteCarloReference(model, data.times, data.sites)
     draws = posterior.sample(jax.random.key(0), data.y, posterior.proposal(data.y), 20_000)
-    mean, sd = lfm.smooth(model, data.times, data.y, sites=data.sites).force("u")
+    mean, sd = lfm.smooth(model, data.times, data.y, factors=data.factors).force("u")
     exact, spread = draws.mean((0, 1)), draws.std((0, 1))
     mean_error, sd_error = np.abs(mean - exact) / spread, np.abs(sd / spread - 1)
     print(f"{name}: means {mean_error.max():.4f} sd at most, sds {sd_error.max():.4f}")

@@ -1,4 +1,4 @@
-"""The site engine against dense Gaussian algebra, importance sampling and differences."""
+"""The factor engine against dense Gaussian algebra, importance sampling and differences."""
 
 import itertools
 from functools import partial
@@ -14,9 +14,9 @@ from scipy import special, stats
 
 import lfm_ppl as lfm
 from lfm_ppl.filtering.ep.importance import importance_weights
-from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.filtering.moments import Moments
-from lfm_ppl.filtering.update import LinearizedObservation, Sites, multiply_by_sites
+from lfm_ppl.filtering.update import Factors, LinearizedObservation, multiply_by_factors
 
 TIMES = np.linspace(0.0, 8.0, 20)
 THETA = jnp.array([0.1, 0.05, -0.1])
@@ -62,9 +62,9 @@ def data(name):
     return FAMILIES[name][2](rng, f).astype(float)[:, None]
 
 
-def likelihood(name, theta, sites=None):
+def likelihood(name, theta, factors=None):
     model = process(FAMILIES[name][0](theta), jnp.exp(theta[0]), 1.3 * jnp.exp(theta[1]))
-    return lfm.MarginalLikelihood(model, TIMES, sites=sites)
+    return lfm.MarginalLikelihood(model, TIMES, factors=factors)
 
 
 def importance(name, y, mean, cov, draws=DRAWS):
@@ -172,22 +172,22 @@ def differences(value, theta, h=1e-3):
             / (12 * h) for e in np.eye(theta.size)]
 
 
-@pytest.mark.parametrize("name, sites", [
+@pytest.mark.parametrize("name, factors", [
     ("Student-t", None),
     *(pytest.param(name, None, marks=pytest.mark.slow) for name in ("Poisson", "negative binomial", "Bernoulli")),
-    *(pytest.param("Poisson", sites, marks=pytest.mark.slow)
-      for sites in (SiteSettings(power=0.5), SiteSettings("variational"), SiteSettings("laplace"))),
+    *(pytest.param("Poisson", factors, marks=pytest.mark.slow)
+      for factors in (FactorSettings(power=0.5), FactorSettings("variational"), FactorSettings("laplace"))),
 ])
-def test_gradient_is_that_of_the_value(name, sites):
-    """By differences of fourth order; the sites are held fixed, and what the family's parameters do is not."""
+def test_gradient_is_that_of_the_value(name, factors):
+    """By differences of fourth order; the factors are held fixed, and what the family's parameters do is not."""
     y = data(name)
-    value = jax.jit(lambda theta: likelihood(name, theta, sites).log_prob(y))
-    gradient = np.asarray(jax.jit(jax.grad(lambda theta: likelihood(name, theta, sites).log_prob(y)))(THETA))
+    value = jax.jit(lambda theta: likelihood(name, theta, factors).log_prob(y))
+    gradient = np.asarray(jax.jit(jax.grad(lambda theta: likelihood(name, theta, factors).log_prob(y)))(THETA))
     np.testing.assert_allclose(gradient, differences(value, THETA), atol=2e-7)
 
 
 @pytest.mark.slow
-def test_with_gaussian_sites_it_is_the_gaussian_filter():
+def test_with_gaussian_factors_it_is_the_gaussian_filter():
     """Value and gradient, two outputs of which one also mixes the forces, missing entries."""
     rng = np.random.default_rng(0)
     y = rng.normal(size=(TIMES.size, 2))
@@ -202,9 +202,9 @@ def test_with_gaussian_sites_it_is_the_gaussian_filter():
         return lfm.MarginalLikelihood(model, TIMES).log_prob(y)
 
     expected, gradient = jax.jit(jax.value_and_grad(lambda th: log_prob(th, lambda g: g)))(THETA)
-    result, of_sites = jax.jit(jax.value_and_grad(lambda th: log_prob(th, lfm.Observations)))(THETA)
+    result, of_factors = jax.jit(jax.value_and_grad(lambda th: log_prob(th, lfm.Observations)))(THETA)
     assert result == pytest.approx(float(expected), rel=1e-12)
-    np.testing.assert_allclose(of_sites, gradient, rtol=1e-12, atol=1e-11)
+    np.testing.assert_allclose(of_factors, gradient, rtol=1e-12, atol=1e-11)
 
 
 def test_update_in_natural_parameters_against_dense_algebra():
@@ -214,15 +214,15 @@ def test_update_in_natural_parameters_against_dense_algebra():
     p, omega = root @ root.T, np.diag([0.1, 0.0, 0.2])
     m, value, centre, nu = rng.normal(size=4), rng.normal(size=3), rng.normal(size=3), rng.normal(size=3)
     tau = np.array([2.0, -0.02, 0.0])
-    # The joint state (s, e) has the precision of the prior and of the sites.
+    # The joint state (s, e) has the precision of the prior and of the factors.
     prior = np.zeros((7, 7))
     prior[:4, :4], prior[4:, 4:] = p, omega + 1e-13 * np.eye(3)
     both = np.concatenate([h, np.eye(3)], axis=1)
     precision = np.linalg.inv(prior) + both.T @ np.diag(tau) @ both
     posterior = np.linalg.inv(precision)
     shift = both.T @ (nu - tau * (value - centre))
-    result = multiply_by_sites(LinearizedObservation(jnp.asarray(value), jnp.asarray(h), jnp.asarray(omega)),
-                              Sites(*map(jnp.asarray, (centre, nu, tau))), Moments(jnp.asarray(m), jnp.asarray(p)))
+    result = multiply_by_factors(LinearizedObservation(jnp.asarray(value), jnp.asarray(h), jnp.asarray(omega)),
+                              Factors(*map(jnp.asarray, (centre, nu, tau))), Moments(jnp.asarray(m), jnp.asarray(p)))
     np.testing.assert_allclose(result.moments.mean, m + (posterior @ shift)[:4], rtol=1e-8)
     np.testing.assert_allclose(result.moments.covariance, posterior[:4, :4], rtol=1e-8)
     away = value - centre
@@ -245,9 +245,9 @@ def test_leave_one_out_terms_are_differences_of_evidences():
 
 
 @pytest.mark.slow
-def test_sites_that_do_not_converge_are_minus_infinity_with_a_finite_gradient_and_a_warning():
+def test_factors_that_do_not_converge_are_minus_infinity_with_a_finite_gradient_and_a_warning():
     y = data("Student-t")
-    short = SiteSettings(sweeps=2)
+    short = FactorSettings(sweeps=2)
     with pytest.warns(lfm.FilterWarning):
         assert likelihood("Student-t", THETA, short).log_prob(y) == -np.inf
     value, gradient = jax.jit(jax.value_and_grad(lambda th: likelihood("Student-t", th, short).log_prob(y)))(THETA)
@@ -325,13 +325,13 @@ def test_a_series_of_large_counts():
     np.testing.assert_allclose(counts, gaussian - np.log(y).sum(), atol=1e-5)
 
 
-def test_settings_of_the_sites_are_checked():
-    for settings, name in (("expectation", "expectation"), (SiteSettings(power=0.0), "power"),
-                           (SiteSettings("laplace", power=0.5), "power")):
+def test_settings_of_the_factors_are_checked():
+    for settings, name in (("expectation", "expectation"), (FactorSettings(power=0.0), "power"),
+                           (FactorSettings("laplace", power=0.5), "power")):
         with pytest.raises(ValueError, match=name):
             likelihood("Poisson", THETA, settings)
-    with pytest.raises(ValueError, match="sites"):
-        lfm.MarginalLikelihood(process(lfm.GaussianObservation(force, jnp.ones(1))), TIMES, sites="ep")
+    with pytest.raises(ValueError, match="factors"):
+        lfm.MarginalLikelihood(process(lfm.GaussianObservation(force, jnp.ones(1))), TIMES, factors="ep")
 
 
 def pushed(theta):
@@ -355,17 +355,17 @@ def test_replicates_with_steps_that_follow_a_tolerance():
     np.testing.assert_allclose(result.input_covariance, expected.input_covariance, rtol=1e-6)
 
 
-HOPELESS = SiteSettings(sweeps=1, relinearisations=2)
-"""With which sites do not converge."""
+HOPELESS = FactorSettings(sweeps=1, relinearisations=2)
+"""With which factors do not converge."""
 
 
 @pytest.mark.slow
-def test_sites_that_do_not_converge_leave_assumed_density_filtering_to_a_model_that_is_not_linear():
+def test_factors_that_do_not_converge_leave_assumed_density_filtering_to_a_model_that_is_not_linear():
     """Value and gradient."""
     theta, y = jnp.array([0.0, 0.0, 1.5]), np.array([[3.0], [5.0], [4.0], [np.nan], [1.0], [2.0]])
 
     def distribution(th):
-        return lfm.MarginalLikelihood(pushed(th), TIMES[:6], steps=1, sites=HOPELESS)
+        return lfm.MarginalLikelihood(pushed(th), TIMES[:6], steps=1, factors=HOPELESS)
 
     both = jax.jit(jax.value_and_grad(lambda th: distribution(th).log_prob(y)))
     value, gradient = both(theta)
@@ -374,11 +374,11 @@ def test_sites_that_do_not_converge_leave_assumed_density_filtering_to_a_model_t
 
 
 @pytest.mark.slow
-def test_sites_that_do_not_converge_are_told_and_leave_nearly_the_same_force():
+def test_factors_that_do_not_converge_are_told_and_leave_nearly_the_same_force():
     theta = jnp.array([0.0, 0.0, 1.5])
     y = lfm.simulate(jax.random.key(1), pushed(theta), TIMES).y
     with pytest.warns(lfm.FilterWarning):
-        smoothed = lfm.smooth(pushed(theta), TIMES, y, steps=2, sites=HOPELESS)
+        smoothed = lfm.smooth(pushed(theta), TIMES, y, steps=2, factors=HOPELESS)
     assert not smoothed.converged
     assert np.linalg.eigvalsh(smoothed.covariance).min() > -1e-12
     np.testing.assert_array_equal(smoothed.leave_one_out, smoothed.log_likelihood)
@@ -431,7 +431,7 @@ def test_weighted_draws_of_the_smoother_estimate_the_evidence(name):
     """Against importance sampling by dense algebra, to five standard errors of both; also with negative precisions."""
     y = data(name)
     distribution = likelihood(name, THETA)
-    run = jax.jit(lambda key: importance_weights(distribution.problem, jnp.asarray(y), key, 20_000, SiteSettings()))
+    run = jax.jit(lambda key: importance_weights(distribution.problem, jnp.asarray(y), key, 20_000, FactorSettings()))
     log_weights = np.asarray(run(jax.random.key(0)))
     result = distribution.smooth(y)
     cov = np.cov(np.asarray(result.sample(jax.random.key(0), 4000).forces["u"]).T) * 1.1
@@ -473,7 +473,7 @@ def test_residuals_are_standard_normal_and_white_where_the_model_holds(name):
 
 
 @pytest.mark.slow
-def test_the_gradient_where_points_of_linearisation_depend_on_sites_of_data_that_are_far_off():
+def test_the_gradient_where_points_of_linearisation_depend_on_factors_of_data_that_are_far_off():
     """Half of the nodes in the sweeps that choose the points made it wrong by one in a hundred."""
     rng = np.random.default_rng(0)
     times = np.sort(np.r_[0.0, 0.0, np.linspace(0.0, 8.0, 18), 3.0, 3.0])

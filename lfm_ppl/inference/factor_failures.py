@@ -1,4 +1,4 @@
-"""Diagnostics of likelihoods with sites: where sites do not converge, and how many weighted trajectories count."""
+"""Diagnostics of likelihoods with factors: where factors do not converge, and how many weighted trajectories count."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _WEIGHT_DRAWS = 25
 
 
 @dataclass(frozen=True)
-class SiteFailures:
-    """Counts of points at which sites do not converge or the likelihood is zero.
+class FactorFailures:
+    """Counts of points at which factors do not converge or the likelihood is zero.
 
     Attributes:
         points: number of points.
-        unconverged: points at which sites do not converge.
+        unconverged: points at which factors do not converge.
         impossible: points at which the likelihood is zero, for that reason or another.
     """
 
@@ -50,7 +50,7 @@ class PathESS:
     least: float
 
 
-def site_failures(bound: BoundModel, z: np.ndarray, seed: int = 0) -> SiteFailures | None:
+def factor_failures(bound: BoundModel, z: np.ndarray, seed: int = 0) -> FactorFailures | None:
     """Evaluate the likelihood at proposals of a sampler: draws plus scaled differences of two other draws.
 
     At draws themselves the likelihood is never zero, because a sampler rejects such points. The proposals of
@@ -62,11 +62,11 @@ def site_failures(bound: BoundModel, z: np.ndarray, seed: int = 0) -> SiteFailur
         seed: seed of the choice of draws.
 
     Returns:
-        Counts; None for a model of Gaussian observations without constraints, which has no sites.
+        Counts; None for a model of Gaussian observations without constraints, which has no factors.
 
     Source: ter Braak (2006), Statistics and Computing 16.
     """
-    if not bound.site.example.has_sites or not z.size:
+    if not bound.site.example.has_factors or not z.size:
         return None
     flat = z.reshape(-1, z.shape[-1])
     first, second, third = np.random.default_rng(seed).integers(len(flat), size=(3, POINTS))
@@ -74,9 +74,9 @@ def site_failures(bound: BoundModel, z: np.ndarray, seed: int = 0) -> SiteFailur
     return failures_at(bound, bound.constrain_draws(proposals))
 
 
-def failures_at(bound: BoundModel, values: Mapping[str, Any]) -> SiteFailures | None:
+def failures_at(bound: BoundModel, values: Mapping[str, Any]) -> FactorFailures | None:
     """Evaluate the likelihood at values of the sites, name -> (S, ...), or at `POINTS` of them; None as above."""
-    if not bound.site.example.has_sites:
+    if not bound.site.example.has_factors:
         return None
 
     def per_draw(values: Any, key: jax.Array, y: Any) -> tuple[jax.Array, jax.Array]:
@@ -86,9 +86,9 @@ def failures_at(bound: BoundModel, values: Mapping[str, Any]) -> SiteFailures | 
         return np.all(np.asarray(flags).reshape(len(flags), -1), axis=1)
 
     converged, possible = map(in_all_series, map_draws(
-        bound, DrawFunction("convergence of the sites", per_draw), _evenly_spaced(values, POINTS), jax.random.key(0),
+        bound, DrawFunction("convergence of the factors", per_draw), _evenly_spaced(values, POINTS), jax.random.key(0),
         rows=bound.times.size))
-    return SiteFailures(len(converged), int((~converged).sum()), int((~possible).sum()))
+    return FactorFailures(len(converged), int((~converged).sum()), int((~possible).sum()))
 
 
 def path_ess(bound: BoundModel, values: Mapping[str, Any]) -> PathESS | None:
