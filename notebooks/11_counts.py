@@ -72,7 +72,7 @@ print(f"log Z by EP: {float(likelihood.log_prob(y)):.4f}")
 
 # %%
 shared = Path(os.environ.get("LFM_DATA", "../shared/data"))
-data = str(shared) if (shared / problem.EVENTS).is_file() and not quick else None
+data = str(shared) if (shared / problem.DISASTERS).is_file() and not quick else None
 settings = study.CountsSettings.quick() if quick else study.CountsSettings(
     data=data, problems=(problem.COAL, *problem.SIMULATED))
 # The folder of an earlier run with these settings; without one everything is computed here.

@@ -1,7 +1,7 @@
 r"""The evidence of data under constraints, Z(y, c) / Z(c).
 
-Z(y, c) is the joint density of the data and of the event that all constraints hold, Z(c) the prior probability of this
-event. Without the denominator the prior of the parameters would favour values for which the constraints hold anyway.
+Z(y, c) is the joint density of the data and of all constraints being met, Z(c) the prior probability that they are
+met. Without the denominator the prior of the parameters would favour values for which the constraints hold anyway.
 
 1. Expectation propagation with one factor for each box and row (`lfm_ppl.constrained.boxes`) and exact factors of the
    data gives a Gaussian approximation, and an approximate log Z.

@@ -4,7 +4,7 @@
 2. `log_prob` runs the filter of all regimes, in which the states are merged by their moments (`switching.regimes`).
 3. `smooth` gives probabilities of the regimes and moments of the state, as averages over draws of regimes.
 4. `sample_path` draws states and regimes given the data; `lfm_ppl.fit` stores such paths.
-5. `sample` simulates the real model by `switching.switched_simulation`, with the chain as its rule.
+5. `sample` simulates the real model by `switching.switched_simulation`, with the chain as its controller.
 
 Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8); Lindsten and others (2016), IEEE
 Journal of Selected Topics in Signal Processing 10(2).

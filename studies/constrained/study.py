@@ -113,7 +113,7 @@ def other_rows(data: Data) -> dict[str, Any]:
     cells = row(data["ballistic"], {"target, RMSE of {path} ({unit})": "rmse", "target, converged": "converged"})
     cells |= row(data["thyroid"], {
         "patients, RMSE of TRH (nmol/l)": "rmse", "patients, coverage of TRH": "coverage",
-        "patients, {event} within 1 h": lambda patients: patients.peak <= estimators.MAX_PEAK_ERROR,
+        "patients, {quantity} within 1 h": lambda patients: patients.peak <= estimators.MAX_PEAK_ERROR,
         "patients, Pareto k above 0.7": lambda patients: ~(patients.k <= LARGEST_K),
         "patients, converged": "converged", "patients, bands converged": "bands_converged"})
     return {name: {"value": cells[name], f"value{SE}": cells[name + SE]} for name in cells if not name.endswith(SE)}
@@ -127,9 +127,9 @@ STUDY = Study(
      "ballistic": TaskKind(estimators.ballistic, {
          "dataset path": "rmse", "dataset": "converged", "path time": "estimate, truth"}),
      "thyroid": TaskKind(estimators.thyroid, {
-         "dataset": "rmse, coverage, lowest, k, converged, bands_converged", "dataset event": "peak",
+         "dataset": "rmse, coverage, lowest, k, converged, bands_converged", "dataset quantity": "peak",
          "dataset time": "truth, mode, mean, low, high", "time": "times", "dataset parameter": "z",
          "dataset draw parameter": "draws", "hour output": "y", "hour": "measured"})},
     tables, figures.draw, {
         "path": ("path", tuple(problem.TARGET_PATHS)), "unit": ("path", tuple(problem.TARGET_PATHS.values())),
-        "event": ("event", ("greatest TRH", "peak of the day's wave of TRH"))}, label="estimator")
+        "quantity": ("quantity", ("greatest TRH", "peak of the day's wave of TRH"))}, label="estimator")

@@ -38,7 +38,7 @@ NAMES = (COAL, *CALLS, *SIMULATED)
 FIRST_DATE, LAST_DATE = 1851.2026, 1962.2218
 """15 March 1851 and 22 March 1962, the period of the disasters (years)."""
 
-EVENTS = Path("coal") / "coal.csv"
+DISASTERS = Path("coal") / "coal.csv"
 """File with the dates of the disasters, in the folder of data."""
 
 BINS_PER_COUNT, BLOCK, DAY_HOURS = 4, 6, 14.0
@@ -136,7 +136,7 @@ def _build_coal(size: ProblemSize, seed: int, data: str | None) -> CountsProblem
     if data is None:
         y = np.asarray(lfm.simulate(jax.random.key(seed), build_model(**definitions["TRUTH"]), times).y)
     else:
-        dates = pd.read_csv(Path(data) / EVENTS)["date"]
+        dates = pd.read_csv(Path(data) / DISASTERS)["date"]
         times, y = definitions["count"](dates, FIRST_DATE, LAST_DATE, size.bins)
     priors = {"level": dist.Normal(0.0, 1.5), "scale": dist.LogNormal(-0.3, 0.6),
               "lengthscale": dist.LogNormal(3.0, 0.7)}

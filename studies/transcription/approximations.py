@@ -19,7 +19,7 @@ from ..timing import time_call, time_compiled_call
 from . import problem
 
 SEARCHES = {"LA": ("newton", "riemann"), "LA, trust region": ("trust-region", "linear")}
-"""Method -> search for the mode, and integration rule of the grid: the source's, and a robust search."""
+"""Method -> search for the mode, and quadrature of the grid: the source's, and a robust search."""
 
 SMOOTHERS: dict[str, tuple[lfm.Rule, int, float]] = {
     "GFS": (lfm.Cubature(full_state=True), 0, 1.0), "GHS(7)": (lfm.GaussHermite(7), 0, 1.0),
@@ -55,8 +55,8 @@ def compute(settings: Mapping[str, Any], data: list[problem.DataSet]) -> Result:
 
 @eqx.filter_jit
 def _search(method: str, link: str, gamma: jax.Array, rates: problem.Rates, y: jax.Array) -> Result:
-    search, rule = SEARCHES[method]
-    mode = laplace.run(problem.on_grid(link, gamma, rates, rule), y, search, SEARCH_STEPS, TOLERANCE)
+    search, quadrature = SEARCHES[method]
+    mode = laplace.run(problem.on_grid(link, gamma, rates, quadrature), y, search, SEARCH_STEPS, TOLERANCE)
     return {"mean": mode.mode[0], "sd": mode.sd[0], "stopped": mode.stopped, "converged": mode.converged,
             "iterations": mode.iterations}
 

@@ -97,9 +97,9 @@ def system(link: str, gamma: Any, rates: Rates, noise_sd: Any = NOISE, lengthsca
                               gamma, start=rates.start)
 
 
-def on_grid(link: str, gamma: Any, rates: Rates, rule: str = "riemann") -> lfm.LatentGrid:
-    """Return the model with its force on the grid, by default with the integration rule of the source."""
-    return lfm.LatentGrid(system(link, gamma, rates), TIMES, GRID, rule)
+def on_grid(link: str, gamma: Any, rates: Rates, quadrature: str = "riemann") -> lfm.LatentGrid:
+    """Return the model with its force on the grid, by default with the quadrature of the source."""
+    return lfm.LatentGrid(system(link, gamma, rates), TIMES, GRID, quadrature)
 
 
 @dataclass(frozen=True)

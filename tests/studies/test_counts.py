@@ -13,7 +13,7 @@ from lfm_ppl.studies.counts import figures, methods, problem, reference, study
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 DATA = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data"))
-needs_data = pytest.mark.skipif(not (DATA / problem.EVENTS).is_file(),
+needs_data = pytest.mark.skipif(not (DATA / problem.DISASTERS).is_file(),
                                 reason=f"{DATA} is not there; LFM_DATA says where")
 
 

@@ -1,4 +1,4 @@
-"""Discrete inputs that follow a known rule, such as a heater under its thermostat."""
+"""Controllers of discrete inputs, such as the thermostat of a heater."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 from lfm_ppl.utils import checks
 
 
-class SwitchingRule(eqx.Module):
-    """Rule by which a discrete input changes: a function of its value and a reading of the state.
+class Controller(eqx.Module):
+    """Controller of a discrete input: the next value follows from the current one and a reading of the state.
 
         r_k = g(x(t_k), u(t_k), t_k) + N(0, diag(variance)),    d_k = decide(d_k-1, r_k, t_k),
 
@@ -40,7 +40,7 @@ class SwitchingRule(eqx.Module):
         raise NotImplementedError
 
 
-class Thermostat(SwitchingRule):
+class Thermostat(Controller):
     """Thermostat of a heater, which is on below the set point and off above it.
 
         d_k = 1 if r_k < s(t_k) - b/2,    0 if r_k > s(t_k) + b/2,    d_k-1 otherwise,
