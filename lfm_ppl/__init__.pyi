@@ -9,7 +9,7 @@ from .constrained.moving_horizon import MovingHorizon as MovingHorizon
 from .constrained.moving_horizon import moving_horizon as moving_horizon
 from .constrained.posterior import constrained_posterior as constrained_posterior
 from .filtering.breakdown import FilterWarning as FilterWarning
-from .filtering.ep.settings import SiteSettings as SiteSettings
+from .filtering.ep.settings import FactorSettings as FactorSettings
 from .filtering.filter import FilterState as FilterState
 from .filtering.filter import filter as filter
 from .filtering.smoother import smooth as smooth
@@ -92,9 +92,9 @@ from .space.equations import heat as heat
 from .space.equations import wave as wave
 from .space.fields import SeparableField as SeparableField
 from .space.fields import SpectralField as SpectralField
+from .switching.controller import Controller as Controller
+from .switching.controller import Thermostat as Thermostat
 from .switching.rao_blackwellised import rao_blackwellised as rao_blackwellised
-from .switching.rule import SwitchingRule as SwitchingRule
-from .switching.rule import Thermostat as Thermostat
 from .switching.switched_simulation import simulate_switched as simulate_switched
 from .switching.switching_likelihood import Switching as Switching
 from .utils.compilation import fast_loops as fast_loops

@@ -61,7 +61,7 @@ FORCE = "log transmission"
 START_SD = 1.0
 DAYS = 60
 STEPS = 1
-SITES = lfm.SiteSettings(relinearisations=2)  # log likelihood within 0.01 of 8 relinearisations or shorter steps
+FACTORS = lfm.FactorSettings(relinearisations=2)  # log likelihood within 0.01 of 8 relinearisations or shorter steps
 
 
 def build(r0, scale, lengthscale, concentration, recovery, reporting, population=100_000.0, start=30.0, width=1.0,
@@ -143,7 +143,7 @@ def model(times, y=None, population: float = 100_000.0, start: float = 30.0, wid
     _check(population, start, width)
     width = width or _usual_distance(times)
     system = build(**parameters(), population=population, start=start, width=width, units=units)
-    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS, sites=SITES), obs=y)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=STEPS, factors=FACTORS), obs=y)
 
 
 def anchors(data: lfm.Data) -> dict[str, float]:

@@ -16,7 +16,7 @@ and normal as in the source, f half of that. All are in nm/s^2, distances in km,
 
 Positions are in axes that do not turn (GCRS). A data file has the columns time_h, x, y and z, the time in hours
 after the option `epoch`, which is in seconds of GPS time; `lfm_ppl.orbits.read_sp3` and `Environment.celestial`
-make them from SP3 files, and `lfm-ppl compare gps --data FOLDER` runs the whole experiment on such files.
+make them from SP3 files, and `lfm-ppl compare gps --data FOLDER` runs the whole study on such files.
 
 Published positions are smoothed by another model, so that their scatter carries no information on the forces:
 noise_sd is fixed at 5 cm unless it is freed.

@@ -39,16 +39,16 @@ numpyro.enable_x64()
 
 import pandas as pd
 
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.ginzburg_landau import experiment, figures, problem
+from lfm_ppl.studies import scores
+from lfm_ppl.studies.ginzburg_landau import figures, problem, study
 
 quick = bool(os.environ.get("LFM_QUICK"))
-settings = experiment.GinzburgLandauSettings()
+settings = study.GinzburgLandauSettings()
 if quick:
     settings = settings.quick(realisations=1, conditional=2)
 # The folder of an earlier run of `lfm-ppl compare ginzburg-landau`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "double-well"))
-result = experiment.STUDY.run(settings, folder)
+result = study.STUDY.run(settings, folder)
 truth = problem.realisation(settings.figure, settings.seed)
 states, chains = (result.data[kind].isel(dataset=settings.figure) for kind in ("state", "mcmc"))
 pd.set_option("display.width", 160, "display.max_columns", 30)

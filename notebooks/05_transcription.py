@@ -43,17 +43,17 @@ numpyro.enable_x64()
 import pandas as pd
 
 import lfm_ppl as lfm
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.transcription import experiment, figures, parameters, parameters_report, problem
+from lfm_ppl.studies import scores
+from lfm_ppl.studies.transcription import figures, parameters, parameters_study, problem, study
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
-settings = experiment.TranscriptionSettings()
+settings = study.TranscriptionSettings()
 if quick:
     settings = settings.quick(datasets=1, configurations=("exponential",))
 # The folder of an earlier run of `lfm-ppl compare transcription`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/transcription"))
-computed = experiment.STUDY.run(settings, folder)
+computed = study.STUDY.run(settings, folder)
 
 # %% [markdown]
 # ## One data set, exponential response
@@ -114,10 +114,10 @@ scores.readable(computed.tables["paired"])
 #     lfm-ppl compare transcription-parameters
 
 # %%
-chosen = parameters_report.TranscriptionParametersSettings()
+chosen = parameters_study.TranscriptionParametersSettings()
 if quick:
     chosen = chosen.quick()
-posteriors = parameters_report.STUDY.run(chosen, folder.parent / "transcription-parameters")
+posteriors = parameters_study.STUDY.run(chosen, folder.parent / "transcription-parameters")
 scores.readable(posteriors.tables["agreement"])
 
 # %% [markdown]
@@ -126,7 +126,7 @@ scores.readable(posteriors.tables["agreement"])
 # Carlo error in brackets.
 
 # %%
-drawn = parameters_report.draw(chosen, posteriors.data)
+drawn = parameters_study.draw(chosen, posteriors.data)
 drawn["posteriors-softplus"]
 
 # %%

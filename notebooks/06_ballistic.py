@@ -20,7 +20,7 @@
 #
 # The source is J. Hartikainen, M. Seppanen and S. Sarkka, *State-space inference for non-linear latent force models*
 # (ICML 2012), section 5.2 and figure 1. It shows one target; here are many, simulated at its parameters. The same
-# experiment runs from the command line, where it can be stopped and resumed:
+# study runs from the command line, where it can be stopped and resumed:
 #
 #     lfm-ppl compare ballistic
 
@@ -37,17 +37,17 @@ import jax
 import numpy as np
 import pandas as pd
 
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.ballistic import experiment, figures
 from lfm_ppl.inference.bound_model import likelihood_site
 from lfm_ppl.io import loading
+from lfm_ppl.studies import scores
+from lfm_ppl.studies.ballistic import figures, study
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
-settings = experiment.BallisticSettings.quick(runs=2) if quick else experiment.BallisticSettings()
+settings = study.BallisticSettings.quick(runs=2) if quick else study.BallisticSettings()
 # The folder of an earlier run of `lfm-ppl compare ballistic`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/ballistic"))
-result = experiment.STUDY.run(settings, folder)
+result = study.STUDY.run(settings, folder)
 
 # %% [markdown]
 # ## One target

@@ -40,8 +40,8 @@ numpyro.enable_x64()
 import pandas as pd
 
 import lfm_ppl as lfm
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.gps import experiment, figures, problem
+from lfm_ppl.studies import scores
+from lfm_ppl.studies.gps import figures, problem, study
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 170, "display.max_columns", 30)
@@ -62,12 +62,12 @@ else:
 
 # %%
 if quick:
-    settings = experiment.GpsSettings(satellites=problem.SIMULATED[:1], alternatives=0, train_days=1.0)
+    settings = study.GpsSettings(satellites=problem.SIMULATED[:1], alternatives=0, train_days=1.0)
 else:
-    settings = experiment.GpsSettings(data=str(shared) if real else None)
+    settings = study.GpsSettings(data=str(shared) if real else None)
 # The folder of an earlier run of `lfm-ppl compare gps`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/gps"))
-result = experiment.STUDY.run(settings, folder)
+result = study.STUDY.run(settings, folder)
 predicted, online = result.data["predict"], result.data.get("online")
 for reason in result.data["left out"].reason.values if "left out" in result.data else ():
     print(f"left out, {reason}\n")

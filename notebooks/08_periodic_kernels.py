@@ -19,7 +19,7 @@
 # keep the variance (SQM) or add to it (WQM).
 #
 # The source is S. Reece and others, *Efficient state-space inference of periodic latent force models* (JMLR 15, 2014),
-# sections 5 and 6. The same experiment runs from the command line:
+# sections 5 and 6. The same study runs from the command line:
 #
 #     lfm-ppl compare periodic-kernels
 
@@ -37,15 +37,15 @@ import numpy as np
 import pandas as pd
 
 import lfm_ppl as lfm
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.periodic_kernels import experiment, figures
+from lfm_ppl.studies import scores
+from lfm_ppl.studies.periodic_kernels import figures, study
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
-settings = experiment.PeriodicKernelSettings.quick() if quick else experiment.PeriodicKernelSettings()
+settings = study.PeriodicKernelSettings.quick() if quick else study.PeriodicKernelSettings()
 # The folder of an earlier run of `lfm-ppl compare periodic-kernels`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/periodic-kernels"))
-result = experiment.STUDY.run(settings, folder)
+result = study.STUDY.run(settings, folder)
 
 # %% [markdown]
 # ## Eigenfunctions

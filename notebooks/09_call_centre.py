@@ -26,7 +26,7 @@
 # hours on the fourth, which it tracks: at every five minutes the estimate is that of the filter, given the readings up
 # to then. The test day has the service rate of training, or 15 in its first half and 5 in its second.
 #
-# The same experiment runs from the command line, where it can be stopped and resumed:
+# The same study runs from the command line, where it can be stopped and resumed:
 #
 #     lfm-ppl compare call-centre --data FOLDER
 
@@ -41,19 +41,19 @@ numpyro.enable_x64()
 
 import pandas as pd
 
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.call_centre import counts, experiment, figures, problem
+from lfm_ppl.studies import scores
+from lfm_ppl.studies.call_centre import counts, figures, problem, study
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
 shared = Path(os.environ.get("LFM_DATA", "../shared/data")) / "calls"
 data = str(shared) if shared.is_dir() and not quick else None
-settings = experiment.CallCentreSettings.quick(days=1) if quick else experiment.CallCentreSettings(data=data)
+settings = study.CallCentreSettings.quick(days=1) if quick else study.CallCentreSettings(data=data)
 # The folder of an earlier run of `lfm-ppl compare call-centre`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/call-centre"))
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", counts.OverloadWarning)
-    result = experiment.STUDY.run(settings, folder)
+    result = study.STUDY.run(settings, folder)
 first = problem.build_window(settings.data, settings.weekday, 0, settings.seed)
 print("real calls" if data else "simulated calls")
 

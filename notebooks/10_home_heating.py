@@ -51,8 +51,8 @@ import numpy as np
 import pandas as pd
 
 import lfm_ppl as lfm
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.home_heating import experiment, figures, problem
+from lfm_ppl.studies import scores
+from lfm_ppl.studies.home_heating import figures, problem, study
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 170, "display.max_columns", 40)
@@ -84,17 +84,17 @@ pd.DataFrame({
 }, index=pd.Index(times[::24], name="hour")).round(3)
 
 # %% [markdown]
-# ## The experiment
+# ## The study
 #
 # Results that the command line has left in its folder are taken from there.
 
 # %%
 folder = problem.data_folder()
 print("real house and simulated homes" if folder else f"no {problem.FILE}: simulated homes only")
-make = experiment.HomeHeatingSettings.quick if quick else experiment.HomeHeatingSettings
+make = study.HomeHeatingSettings.quick if quick else study.HomeHeatingSettings
 settings = make(data=None if folder is None else str(folder))
 kept = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/home-heating"))
-result = experiment.STUDY.run(settings, kept)
+result = study.STUDY.run(settings, kept)
 
 # %% [markdown]
 # ## The real house

@@ -9,14 +9,14 @@
 # ---
 
 # %% [markdown]
-# # Counts, gross errors, yes and no: how good are sites?
+# # Counts, gross errors, yes and no: how good are Gaussian factors?
 #
 # $$f(t) = \text{level} + u(t), \qquad y_k \sim p(\cdot \mid f(t_k)).$$
 #
 # Only `observation=` of a model says what its data are. A family beyond the Gaussian has no closed likelihood, and the
-# filter takes a Gaussian site in the place of each value. `sites=` says how sites are refined: expectation propagation
-# (EP, the default), variational, or Laplace. Here each is held against exact sampling of the same posterior, with the
-# parameters held fixed:
+# filter takes a Gaussian factor in the place of each value. `factors=` says how factors are refined: expectation
+# propagation (EP, the default), variational, or Laplace. Here each is held against exact sampling of the same
+# posterior, with the parameters held fixed:
 #
 # - disasters in British coal mines, 1851 to 1962, in 333 bins of four months (Poisson);
 # - 200 simulated answers of yes or no;
@@ -42,8 +42,8 @@ import numpy as np
 import pandas as pd
 
 import lfm_ppl as lfm
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.counts import experiment, figures, problem
+from lfm_ppl.studies import scores
+from lfm_ppl.studies.counts import figures, problem, study
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
@@ -72,12 +72,12 @@ print(f"log Z by EP: {float(likelihood.log_prob(y)):.4f}")
 
 # %%
 shared = Path(os.environ.get("LFM_DATA", "../shared/data"))
-data = str(shared) if (shared / problem.EVENTS).is_file() and not quick else None
-settings = experiment.CountsSettings.quick() if quick else experiment.CountsSettings(
+data = str(shared) if (shared / problem.DISASTERS).is_file() and not quick else None
+settings = study.CountsSettings.quick() if quick else study.CountsSettings(
     data=data, problems=(problem.COAL, *problem.SIMULATED))
 # The folder of an earlier run with these settings; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/counts"))
-result = experiment.STUDY.run(settings, folder)
+result = study.STUDY.run(settings, folder)
 print("real disasters" if data else "simulated disasters")
 
 # %% [markdown]

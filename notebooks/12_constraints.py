@@ -16,7 +16,7 @@
 # `lfm.full_information`, `lfm.moving_horizon` and `lfm.constrained_posterior`, in time linear in the record.
 #
 # The source is T. M. Wolff, V. G. Lopez, M. A. Müller and T. Beckers, *Inference in latent force models using optimal
-# state estimation*. The same experiment runs from the command line, where it can be stopped and resumed:
+# state estimation*. The same study runs from the command line, where it can be stopped and resumed:
 #
 #     lfm-ppl compare constrained
 
@@ -34,9 +34,9 @@ import pandas as pd
 from matplotlib import pyplot as plt
 
 import lfm_ppl as lfm
-from lfm_ppl.experiments import scores
-from lfm_ppl.experiments.constrained import estimators, experiment, figures, problem
 from lfm_ppl.io import loading
+from lfm_ppl.studies import scores
+from lfm_ppl.studies.constrained import estimators, figures, problem, study
 
 quick = bool(os.environ.get("LFM_QUICK"))
 pd.set_option("display.width", 160, "display.max_columns", 30)
@@ -117,11 +117,11 @@ pd.Series({"a state, Q constant": float(np.sqrt(3.0) / states.state("rate")[0]),
 # one would leave out a force that is exactly zero.
 
 # %%
-settings = experiment.ConstrainedSettings()
+settings = study.ConstrainedSettings()
 # The folder of an earlier run of `lfm-ppl compare constrained`; without one everything is computed here.
 folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/constrained"))
 # Quick mode leaves the study out, which compiles for minutes; `lfm-ppl compare constrained --quick` is a little of it.
-result = None if quick else experiment.STUDY.run(settings, folder)
+result = None if quick else study.STUDY.run(settings, folder)
 quick or scores.readable(result.tables["transcription"])
 
 # %%

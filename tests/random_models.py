@@ -11,6 +11,8 @@ import numpy as np
 
 import lfm_ppl as lfm
 from lfm_ppl.forces import Sum
+from lfm_ppl.studies.periodic_kernels.resonators import resonators
+from lfm_ppl.studies.periodic_kernels.sparse_spectrum import SparseSpectrum
 
 ROWS = 7
 AHEAD = np.array([0.3, 1.0, 2.5, 2.5])
@@ -65,8 +67,8 @@ FORCES = {
     "SQM": lambda s, n, r: lfm.QuasiPeriodic(_kernel(s, n, r), lfm.forces.SQM(1.0 + r, CHANGES), functions=3),
     "WQM": lambda s, n, r: lfm.QuasiPeriodic(_kernel(s, n, r), lfm.forces.WQM(r, CHANGES), functions=3),
     "resonator": lambda s, n, r: lfm.Resonator(1.0 + r, s, r, 0.1 * r),
-    "resonators": lambda s, n, r: lfm.forces.resonators(_kernel(s, n, r), functions=3, noise=0.1 * r, damping=0.1),
-    "sparse spectrum": lambda s, n, r: lfm.forces.SparseSpectrum(s, jnp.array([1.0, 2.3]) * (1 + r)),
+    "resonators": lambda s, n, r: resonators(_kernel(s, n, r), functions=3, noise=0.1 * r, damping=0.1),
+    "sparse spectrum": lambda s, n, r: SparseSpectrum(s, jnp.array([1.0, 2.3]) * (1 + r)),
     "sum": lambda s, n, r: Sum((lfm.Matern(s, n, order=1), lfm.Constant(r), lfm.Matern(s, r + 0.1, order=0))),
     "sum with CQM": lambda s, n, r: Sum((lfm.Matern(s, n, order=2),
                                          lfm.QuasiPeriodic(_kernel(s, n, r), lfm.forces.CQM(n), functions=3))),

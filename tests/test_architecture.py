@@ -3,6 +3,7 @@
 import ast
 import collections
 import graphlib
+import importlib.util
 import json
 import subprocess
 import sys
@@ -16,54 +17,59 @@ PACKAGE = ROOT / "lfm_ppl"
 # Lower layers first. A module belongs to the longest name here that is a prefix of its own, and may
 # import from its own layer and from the layers below.
 LAYERS = (
-    ("utils", "io.table"),
+    ("utils",),
     ("forces",),
     ("linearisation",),
     ("model",),
     ("orbits", "io", "space"),
     ("filtering",),
     ("particles", "fokker_planck_grid", "latent_grid", "constrained"),
-    ("switching",),
     ("likelihoods",),
-    ("switching.switching_likelihood",),
+    ("switching",),
     ("inference",),
+    ("storage",),
     ("orbits.training", "orbits.learning", "orbits.prediction"),
     ("results", "accuracy", "parallel"),
     ("workflows",),
-    ("io.loading",),
-    ("experiments",),
+    ("",),  # the public API
+    ("studies",),
     ("cli", "__main__"),
 )
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
-PUBLIC = "lfm_ppl"  # the public API stands above the library and below the command line
-MODULES = {".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix("__init__").removesuffix("."): path
-           for path in sorted(PACKAGE.rglob("*.py")) if "_models" not in path.parts}
-"""Name below the package, such as ``forces.matern``, -> file."""
+PUBLIC = "lfm_ppl"
+MODULES = {".".join(path.relative_to(root).with_suffix("").parts).removesuffix("__init__").removesuffix("."): path
+           for root, folder in ((ROOT, ROOT / "studies"), (PACKAGE, PACKAGE)) for path in sorted(folder.rglob("*.py"))}
+"""Name below the package, such as ``forces.matern``, -> file; ``studies/`` is the package ``lfm_ppl.studies``."""
 
 
 def tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
-def imports(path: Path) -> list[tuple[int, str, str]]:
-    """Return (line, module below the package, name) of every import of lfm_ppl, also inside functions."""
+def imports(path: Path, package: str = "") -> list[tuple[int, str, str]]:
+    """Return (line, module below lfm_ppl, name) of every import of it, also inside functions of a module of package."""
     result = []
     for node in ast.walk(tree(path)):
         if isinstance(node, ast.Import):
             result += [(node.lineno, alias.name, "") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            base = "." * node.level + (node.module or "")
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
             # `from lfm_ppl.inference import bind` names a module or a member of the package.
             result += [(node.lineno, f"{base}.{a.name}" if f"{base}.{a.name}".removeprefix(f"{PUBLIC}.") in MODULES
                         else base, a.name) for a in node.names]
     return [(line, module.removeprefix(PUBLIC).removeprefix("."), name) for line, module, name in result
-            if module.split(".")[0] in (PUBLIC, "")]
+            if module.split(".")[0] == PUBLIC]
+
+
+def imports_of(module: str) -> list[tuple[int, str, str]]:
+    """Return the imports of a module named below the package."""
+    path = MODULES[module]
+    package = module if path.stem == "__init__" else module.rpartition(".")[0]
+    return imports(path, f"{PUBLIC}.{package}".removesuffix("."))
 
 
 def rank(module: str) -> int:
-    """Return the layer of a module named below the package; the public API stands below those that may import it."""
-    if not module:
-        return RANK["io.loading"]
+    """Return the layer of a module named below the package."""
     parts = module.split(".")
     return next((RANK[name] for length in range(len(parts), 0, -1)
                  if (name := ".".join(parts[:length])) in RANK), len(LAYERS))
@@ -73,9 +79,9 @@ def test_imports_point_down_without_circles_and_without_private_names():
     violations = [f"{module} belongs to no layer" for module in MODULES if rank(module) == len(LAYERS)]
     graph = collections.defaultdict(set)
     for module, path in MODULES.items():
-        for line, imported, name in imports(path):
+        for line, imported, name in imports_of(module):
             if name.startswith("_") or rank(imported) > rank(module):
-                violations.append(f"lfm_ppl/{path.relative_to(PACKAGE)}:{line} imports {imported or PUBLIC} {name}")
+                violations.append(f"{path.relative_to(ROOT)}:{line} imports {imported or PUBLIC} {name}")
             if imported and imported != module:
                 graph[module].add(imported)
     assert violations == []
@@ -94,9 +100,19 @@ def test_models_use_the_public_api_and_do_nothing_when_imported():
     assert violations == []
 
 
+def test_studies_import_public_names_as_a_user_does():
+    public = {*lfm_ppl.__all__, *lfm_ppl.forces.__all__, *lfm_ppl.orbits.__all__}
+    modules = [module for module in MODULES if module.startswith("studies.")]
+    violations = [f"{MODULES[module].relative_to(ROOT)}:{line} imports {name} from {imported}"
+                  for module in modules for line, imported, name in imports_of(module)
+                  if name in public and imported not in ("", "forces", "orbits") and not imported.startswith("studies.")
+                  and imported.rpartition(".")[2] != name]
+    assert violations == []
+
+
 def test_public_classes_have_names_of_their_own():
     names = collections.Counter(
-        node.name for module, path in MODULES.items() if not module.startswith("experiments")
+        node.name for module, path in MODULES.items() if not module.startswith("studies")
         for node in tree(path).body if isinstance(node, ast.ClassDef) and not node.name.startswith("_"))
     assert [name for name, count in names.items() if count > 1] == []
 
@@ -123,5 +139,5 @@ print(json.dumps([alone, parts, others, changed]))
     alone, parts, others, changed = json.loads(run.stdout)
     assert alone == others == changed == []
     assert "lfm_ppl.filtering" in parts and not {
-        f"lfm_ppl.{name}" for name in ("orbits", "particles", "results", "experiments", "cli")} & set(parts)
+        f"lfm_ppl.{name}" for name in ("orbits", "particles", "results", "studies", "cli")} & set(parts)
     assert [name for name in lfm_ppl.__all__ if not hasattr(lfm_ppl, name)] == []

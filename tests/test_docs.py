@@ -62,7 +62,7 @@ def test_a_random_key_is_the_first_argument():
 def test_files_and_names_that_readme_and_contributing_name_exist():
     text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
     folders = re.findall(r"^ {4,6}([\w./]+/?) {2,}", text, re.MULTILINE)
-    paths = set(re.findall(r"`((?:lfm_ppl|tests|docs)/[\w./]*|[A-Z]+\.md)`", text))
+    paths = set(re.findall(r"`((?:lfm_ppl|studies|tests|docs)/[\w./]*|[A-Z]+\.md)`", text))
     linked = re.findall(r"\]\(([\w./]+)(?:#[\w-]+)?\)", README)
     assert len(paths) > 20
     assert [path for path in {*folders, *paths, *linked}

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parent.parent / "lfm_ppl"
-MODULES = sorted(
-    ".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in PACKAGE.rglob("*.py")
+ROOT = Path(__file__).resolve().parent.parent
+MODULES = sorted(  # names below lfm_ppl; studies/ is the package lfm_ppl.studies
+    ".".join(path.relative_to(root).with_suffix("").parts)
+    for root, folder in ((ROOT / "lfm_ppl", ROOT / "lfm_ppl"), (ROOT, ROOT / "studies"))
+    for path in folder.rglob("*.py")
     if path.name not in ("__init__.py", "__main__.py") and ">>> " in path.read_text("utf-8"))
 # Modules whose examples take several seconds to compile.
 COSTLY = {

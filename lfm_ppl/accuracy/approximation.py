@@ -61,7 +61,7 @@ class Refinement:
 
 def more_iterations(example: SeriesLikelihood) -> Refinement | None:
     """Return more iterations of posterior linearisation; None where the likelihood takes none."""
-    if example.has_sites or example.ssm.plan.is_linear or not example.has_gaussian_state:
+    if example.has_factors or example.ssm.plan.is_linear or not example.has_gaussian_state:
         return None
     current = example.settings.iterations
     count = DEFAULT_ITERATIONS if current < DEFAULT_ITERATIONS else max(_MANY_ITERATIONS, 2 * current)

@@ -74,7 +74,7 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
         batch: data sets that make one task; by default all of them in this process, and 25 where there is a folder or
             there are several workers.
         method: "vectorized", the data sets of a task side by side, or "sequential", one after the other. Side by side
-            all of them wait for whichever takes longest, at each step: for its tree with NUTS, and for its sites with
+            all of them wait for whichever takes longest, at each step: for its tree with NUTS, and for its factors with
             an observation family or constraints. None: sequential for the latter, vectorized otherwise.
         folder: storage of the ranks of each task, from which a stopped run resumes; None: no storage.
         overwrite: compute again what was stored with other settings.
@@ -159,8 +159,8 @@ class _Ranks:
             posterior[LOG_LIKELIHOOD] = jax.lax.map(score, posterior)
             return {n: (posterior[n] < truth[n]).sum(0) for n in truth}
 
-        # By default sequentially if sites take different numbers of iterations.
-        method = self.method or ("sequential" if site.example.has_sites else "vectorized")
+        # By default sequentially if factors take different numbers of iterations.
+        method = self.method or ("sequential" if site.example.has_factors else "vectorized")
         # jax.lax.map with a batch size would evaluate both branches of each condition.
         batch_size = self.batch if self.batch > 1 and method == "vectorized" else None
         return jax.jit(lambda keys: jax.lax.map(rank_statistics, keys, batch_size=batch_size))

@@ -32,10 +32,11 @@ from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS, SAMPLERS
 from lfm_ppl.inference.trajectories import evenly_spaced
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
-from lfm_ppl.results import arviz_data, rebuilding, run_record
-from lfm_ppl.results import checkpoint as checkpoints
+from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.scalars import choose, scalar_draws
 from lfm_ppl.results.sites import select_site
+from lfm_ppl.storage import checkpoint as checkpoints
+from lfm_ppl.storage import run_record
 from lfm_ppl.utils import checks
 
 REFERENCES = ("auto", "grid", "particles")

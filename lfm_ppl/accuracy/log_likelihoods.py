@@ -293,7 +293,7 @@ def _particle_estimates(problem: LikelihoodProblem, particles: int, settings: Re
                                     distribution.settings.max_step)
         if takes_smoother_draws(distribution.ssm):
             filtering = filter_problem(distribution.ssm, distribution.settings.rule, time_grid)
-            return importance.log_likelihood(filtering, y, key, particles, as_settings(distribution.settings.sites))
+            return importance.log_likelihood(filtering, y, key, particles, as_settings(distribution.settings.factors))
         return particle_filter.log_likelihood(distribution.ssm, time_grid, y, key, filter_settings)
 
     bound, series = problem.bound, problem.series

@@ -28,8 +28,9 @@ from lfm_ppl.cli.fit_arguments import TIME_UNIT
 from lfm_ppl.cli.options import CheckOptions
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.inference.trajectories import evenly_spaced
-from lfm_ppl.results import arviz_data, checkpoint, files, html_report, rebuilding, tables
+from lfm_ppl.results import arviz_data, html_report, rebuilding, tables
 from lfm_ppl.results.series import times_of
+from lfm_ppl.storage import checkpoint, files
 from lfm_ppl.utils import atomic_files
 from lfm_ppl.utils.interruption import INTERRUPTED, interruptible
 

@@ -36,7 +36,7 @@ from lfm_ppl.cli.options import (
     StudyOptions,
     Text,
 )
-from lfm_ppl.experiments import catalogue
+from lfm_ppl.studies import catalogue
 
 NewFile = Annotated[Text, Parameter(help="Python file to write; an existing file is an error")]
 Study = Annotated[Text, Parameter(help="name of a study; `lfm-ppl compare NAME --help` shows its options")]
@@ -170,16 +170,16 @@ compare = App(name="compare", group_commands=Group.create_default_commands("stud
               help_epilogue=_examples("compare", *(f"compare {example}" for example in STUDY_EXAMPLES)))
 app.command(compare)
 for study in catalogue.names():
-    compare.command(App(name=study, help=catalogue.experiment(study).summary))
+    compare.command(App(name=study, help=catalogue.entry(study).summary))
 
 
 @compare.default
 def list_studies(name: Study | None = None, /, *, options: StudyOptions = StudyOptions()) -> None:
     """Run a published study again, or go on with one that was stopped; without a name, list them."""
     if name is not None:
-        catalogue.experiment(name)  # raises ValueError: studies have commands of their own
+        catalogue.entry(name)  # raises ValueError: studies have commands of their own
     width = max(map(len, catalogue.names()))
-    print("\n".join(f"{name:<{width}}  {catalogue.experiment(name).summary}" for name in catalogue.names()))
+    print("\n".join(f"{name:<{width}}  {catalogue.entry(name).summary}" for name in catalogue.names()))
     print("\n`lfm-ppl compare NAME` runs a study; `--quick` is a short run of a few minutes.")
 
 
@@ -188,9 +188,9 @@ def _add_study(name: str, keep_programs: bool) -> None:
     session.start(1, keep_programs, one_thread=True)  # so that one process finds the numbers of several
     if compare[name].default_command is not None:
         return
-    from lfm_ppl.experiments.study import option_fields
+    from lfm_ppl.studies.declaration import option_fields
 
-    entry, group = catalogue.experiment(name), Group.create_ordered(f"options of {name}")
+    entry, group = catalogue.entry(name), Group.create_ordered(f"options of {name}")
 
     def run_study(*, options: StudyOptions = StudyOptions(), line: Line = (), **settings: Any) -> int:
         from lfm_ppl.cli.compare import run
@@ -225,7 +225,8 @@ def _default(value: Any) -> str:
 def plot(result: Result, /, *, options: PlotOptions = PlotOptions()) -> None:
     """Draw the figures of a saved result again."""
     from lfm_ppl.cli.folders import check_writable
-    from lfm_ppl.results import arviz_data, files, plots
+    from lfm_ppl.results import arviz_data, plots
+    from lfm_ppl.storage import files
 
     path = files.locate(result)
     target = Path(options.out) if options.out else path.parent

@@ -28,8 +28,9 @@ from lfm_ppl.inference.bind import bind
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import OF_SERIES, Data, InputTable, stack_series
 from lfm_ppl.io.truth import read_truth
-from lfm_ppl.results import arviz_data, checkpoint, files, html_report, tables
+from lfm_ppl.results import arviz_data, html_report, tables
 from lfm_ppl.results.fields import add_fields
+from lfm_ppl.storage import checkpoint, files
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.interruption import INTERRUPTED, interruptible
 from lfm_ppl.utils.progress import duration

@@ -25,7 +25,8 @@ from lfm_ppl.cli.options import DataOptions, FitArguments
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
-from lfm_ppl.results import arviz_data, files, html_report, tables
+from lfm_ppl.results import arviz_data, html_report, tables
+from lfm_ppl.storage import files
 from lfm_ppl.utils.progress import duration
 from lfm_ppl.workflows.fit_tasks import file_name
 

@@ -28,10 +28,11 @@ from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
 from lfm_ppl.io.data_set import Data, continued_inputs, on_clock_of_fit
 from lfm_ppl.io.dosing import ROLES
-from lfm_ppl.results import arviz_data, files, html_report, inputs, plots, tables
+from lfm_ppl.results import arviz_data, html_report, inputs, plots, tables
 from lfm_ppl.results.plots.trajectories import trajectory_names
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, MEAN, held_out_data, summary
 from lfm_ppl.results.series import select_series, series_dimension, series_labels
+from lfm_ppl.storage import files
 from lfm_ppl.utils import atomic_files, calendar_time, checks
 
 TABLE = "forecast.csv"

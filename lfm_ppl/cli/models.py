@@ -94,7 +94,8 @@ def _print_sites(model: loading.ModelFile, bound: Any) -> None:
     settings = example.settings
     parts = [f"{settings.rule.name}, {settings.steps} steps",
              settings.iterations and f"{settings.iterations} iterations"]
-    text = ", ".join(filter(None, parts)) + (f"; sites by {example.sites_in_words}" if example.sites_in_words else "")
+    factors = f"; factors by {example.factors_in_words}" if example.factors_in_words else ""
+    text = ", ".join(filter(None, parts)) + factors
     if is_exact(example.ssm) or not example.has_gaussian_state:
         is_exact_likelihood = example.has_gaussian_state and example.ssm.plan.has_exact_moments
         text = "exact: the model is linear" if is_exact_likelihood else example.description

@@ -4,7 +4,7 @@
    may hold an observation, a constraint, or both. `add_times` adds rows with neither.
 2. `augmented_model`: outputs (h, c) with Gaussian noise, for interior points. Each Newton step observes the constraints
    c by pseudo-observations whose variances differ from row to row; `augmented_observations` stacks them with the data.
-3. `stacked_model`: outputs (h, c) without noise, for expectation propagation, whose sites observe them.
+3. `stacked_model`: outputs (h, c) without noise, for expectation propagation, whose factors observe them.
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ def augmented_model(model: LatentForceModel, constraints: Constraints, rows: Row
 
 
 def stacked_model(model: LatentForceModel, constraints: Constraints | Boxes) -> StateSpaceModel:
-    """Return the state-space model with outputs (h, c) without noise, for sites."""
+    """Return the state-space model with outputs (h, c) without noise, for factors."""
     noise = jnp.zeros(len(model.output_names) + constraints.count)
     function = StackedOutputs(model.observation.function, constraints)
     return _replace_observation(model, GaussianObservation(function, noise), constraints)

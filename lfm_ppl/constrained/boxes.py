@@ -1,4 +1,4 @@
-"""Constraints as boxes 0 <= c <= width, one for each bounded quantity, and the likelihood factors of data and boxes."""
+"""Constraints as boxes 0 <= c <= width, one for each bounded quantity, and the exact terms of data and boxes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from lfm_ppl.filtering.ep.quadrature import MeanVariance, TiltedMoments
 class Boxes(eqx.Module):
     """The constraints with both bounds of a quantity as one box 0 <= c(x, u, t) <= width.
 
-    Expectation propagation with two half lines as two sites has an error of 0.2 in the log evidence, because the sites
-    are correlated. A box is one site, whose truncated normal moments have a closed form.
+    Expectation propagation with two half lines as two factors has an error of 0.2 in the log evidence, because the
+    factors are correlated. A box is one factor, whose truncated normal moments have a closed form.
 
     Attributes:
         constraints: the constraints c >= 0.
@@ -80,7 +80,7 @@ def build_boxes(constraints: Constraints) -> Boxes:
 
 
 class BoundedTerms(eqx.Module):
-    """Likelihood factors N(y; f, R) of the data, and 1(0 <= f <= width) of the constraints.
+    """Exact terms N(y; f, R) of the data, and 1(0 <= f <= width) of the constraints.
 
     Attributes:
         y: (K, D), NaN where missing.
@@ -96,7 +96,7 @@ class BoundedTerms(eqx.Module):
 
     @property
     def present(self) -> jax.Array:
-        """Whether an entry has a factor, (K, D + B)."""
+        """Whether an entry has a term, (K, D + B)."""
         return jnp.concatenate([jnp.isfinite(self.y), self.is_constrained], axis=1)
 
     def tilted(self, cavity: MeanVariance, _quadrature_point: MeanVariance, power: float) -> TiltedMoments:
@@ -112,7 +112,7 @@ class BoundedTerms(eqx.Module):
 
 
 def _gaussian_tilted(cavity: MeanVariance, y: jax.Array, variance: jax.Array) -> TiltedMoments:
-    """Return the tilted moments for factors N(y; f, variance)."""
+    """Return the tilted moments for terms N(y; f, variance)."""
     y = jnp.where(jnp.isfinite(y), y, 0.0)
     total = cavity.variance + variance
     gain = cavity.variance / total

@@ -1,11 +1,11 @@
 r"""The evidence of data under constraints, Z(y, c) / Z(c).
 
-Z(y, c) is the joint density of the data and of the event that all constraints hold, Z(c) the prior probability of this
-event. Without the denominator the prior of the parameters would favour values for which the constraints hold anyway.
+Z(y, c) is the joint density of the data and of all constraints being met, Z(c) the prior probability that they are
+met. Without the denominator the prior of the parameters would favour values for which the constraints hold anyway.
 
-1. Expectation propagation with one site for each box and row (`lfm_ppl.constrained.boxes`) and exact sites of the data
-   gives a Gaussian approximation, and an approximate log Z.
-2. A forward scan with the data and tempered sites of the constraints is the proposal of trajectories.
+1. Expectation propagation with one factor for each box and row (`lfm_ppl.constrained.boxes`) and exact factors of the
+   data gives a Gaussian approximation, and an approximate log Z.
+2. A forward scan with the data and tempered factors of the constraints is the proposal of trajectories.
 3. Trajectories that respect all constraints are drawn backwards, each with a weight
    (`lfm_ppl.constrained.feasible_paths`). The mean weight is an unbiased estimate of Z.
 4. Steps 1 to 3 with all data missing give Z(c). The same random numbers in both reduce the variance of the ratio.
@@ -28,12 +28,12 @@ from lfm_ppl.constrained.augmented import Rows, augmented_observations
 from lfm_ppl.constrained.boxes import BoundedTerms, Boxes
 from lfm_ppl.constrained.feasible_paths import FeasiblePaths, sample_feasible_paths
 from lfm_ppl.filtering.ep.evidence import Evidence, evidence
-from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Record
 from lfm_ppl.filtering.problem import FilterProblem, filter_problem
-from lfm_ppl.filtering.update import Sites, SiteUpdate
+from lfm_ppl.filtering.update import Factors, FactorUpdate
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.state_space import StateSpaceModel
@@ -45,7 +45,7 @@ from lfm_ppl.utils.random_keys import split_by_name
 _LOG_2PI = 1.8378770664093453
 
 _TEMPERING = 0.7
-"""Power of the converged sites in the proposal. On dense grids the product of all sites is narrower than the
+"""Power of the converged factors in the proposal. On dense grids the product of all factors is narrower than the
 constraints, and powers from 1/2 to 4/5 give the smallest variance of the weights; on coarse grids power 1 does, and
 powers below 4/5 are worse."""
 
@@ -69,23 +69,23 @@ class TruncatedPosterior(eqx.Module):
     rows: Rows
     boxes: Boxes
     variance: jax.Array
-    settings: SiteSettings
+    settings: FactorSettings
 
     @property
     def is_constrained(self) -> jax.Array:
         """Whether the constraints hold at a row, (K, B)."""
         return jnp.zeros((len(self.rows.times), self.boxes.count), bool).at[self.rows.grid].set(True)
 
-    def _factors(self, y: jax.Array) -> tuple[BoundedTerms, Sites]:
-        """Return the likelihood factors and the exact sites (K, D + B) of the data, zero for the constraints."""
+    def _terms(self, y: jax.Array) -> tuple[BoundedTerms, Factors]:
+        """Return the exact terms and the exact factors (K, D + B) of the data, zero for the constraints."""
         entries = augmented_observations(y, jnp.zeros((len(self.rows.grid), self.boxes.count)), self.rows)
         measured = entries[:, : y.shape[1]]
         noise = jnp.ones(measured.shape).at[self.rows.data].set(self.variance)
         is_present, zeros = jnp.isfinite(measured), jnp.zeros((len(entries), self.boxes.count))
-        data_sites = Sites(jnp.concatenate([jnp.where(is_present, measured, 0.0), zeros], axis=1),
-                           jnp.zeros_like(entries),
-                           jnp.concatenate([jnp.where(is_present, 1.0 / noise, 0.0), zeros], axis=1))
-        return BoundedTerms(measured, noise, self.is_constrained, self.boxes.widths), data_sites
+        data_factors = Factors(jnp.concatenate([jnp.where(is_present, measured, 0.0), zeros], axis=1),
+                               jnp.zeros_like(entries),
+                               jnp.concatenate([jnp.where(is_present, 1.0 / noise, 0.0), zeros], axis=1))
+        return BoundedTerms(measured, noise, self.is_constrained, self.boxes.widths), data_factors
 
     @property
     def problem(self) -> FilterProblem:
@@ -94,17 +94,17 @@ class TruncatedPosterior(eqx.Module):
 
     def propagate_expectations(self, y: jax.Array, record: Record = Record.LIKELIHOOD) -> Evidence:
         """Run expectation propagation; its log evidence is an approximation of log Z(y, c)."""
-        terms, data_sites = self._factors(y)
-        return evidence(self.problem, terms, self.settings, first=data_sites, record=record)
+        terms, data_factors = self._terms(y)
+        return evidence(self.problem, terms, self.settings, first=data_factors, record=record)
 
     def proposal(self, y: jax.Array, propagated: Evidence) -> FilterTrace:
-        """Return the forward scan for `sample_paths`: exact sites of the data, tempered sites of the constraints."""
-        _, data_sites = self._factors(y)
+        """Return the forward scan for `sample_paths`: exact factors of the data, tempered ones of the constraints."""
+        _, data_factors = self._terms(y)
         power = jnp.concatenate([jnp.zeros(y.shape[1]), jnp.full(self.boxes.count, _TEMPERING)])
-        sites = propagated.refined.fixed_point.sites
-        sites = Sites(jnp.where(power > 0, sites.centre, data_sites.centre), power * sites.nu,
-                      jnp.where(power > 0, power * sites.tau, data_sites.tau))
-        return forward(self.problem, SiteUpdate(sites), about=propagated.refined.points, record=Record.SMOOTHER)
+        factors = propagated.refined.fixed_point.factors
+        factors = Factors(jnp.where(power > 0, factors.centre, data_factors.centre), power * factors.nu,
+                          jnp.where(power > 0, power * factors.tau, data_factors.tau))
+        return forward(self.problem, FactorUpdate(factors), about=propagated.refined.points, record=Record.SMOOTHER)
 
     def sample_paths(self, key: jax.Array, forward_pass: FilterTrace, count: int) -> FeasiblePaths:
         """Draw weighted trajectories that respect the constraints, from a proposal."""
@@ -139,7 +139,7 @@ class TruncatedPosterior(eqx.Module):
         propagated = self.propagate_expectations(y)
         forward_pass = self.proposal(y, propagated)
         variance = jnp.broadcast_to(self.variance, y.shape)
-        # The sites of the data lack the normalising constants of its likelihood.
+        # The factors of the data lack the normalising constants of its likelihood.
         data = -0.5 * jnp.where(jnp.isfinite(y), _LOG_2PI + jnp.log(variance), 0.0).sum()
         paths = self.sample_paths(key, forward_pass, count)
         weights = forward_pass.log_likelihood.sum() + data + paths.log_weights
@@ -160,7 +160,7 @@ class TruncatedPosterior(eqx.Module):
         return joint - prior
 
     def converged(self, y: jax.Array) -> jax.Array:
-        """Return whether the sites converge with the data and without them."""
+        """Return whether the factors converge with the data and without them."""
         return _with_and_without_data(
             lambda y: self.propagate_expectations(y).refined.fixed_point.converged, y).all()
 
@@ -204,7 +204,7 @@ def check_variances(model: LatentForceModel, count: int) -> jax.Array:
             raise ValueError("the posterior under constraints takes outputs with independent noise; the observation "
                              "covariance has entries off its diagonal.")
         value = jnp.diagonal(value, axis1=-2, axis2=-1)
-    checks.positive("the observation covariance", value, "Sites need observations with noise.")
+    checks.positive("the observation covariance", value, "Factors need observations with noise.")
     return jnp.broadcast_to(value, (count, value.shape[-1]))
 
 

@@ -2,17 +2,17 @@ r"""Trajectories that respect all constraints, each with a weight whose mean is 
 
 Backwards, from the last row to the first:
 
-1. In a linear model with Gaussian sites t, the state at a row given the state at the next row is Gaussian.
-2. For each constraint i of the row, in turn: divide out its site, which leaves N(c; m_i, v_i) for the constrained
+1. In a linear model with Gaussian factors t, the state at a row given the state at the next row is Gaussian.
+2. For each constraint i of the row, in turn: divide out its factor, which leaves N(c; m_i, v_i) for the constrained
    quantity c; draw c from the truncated normal distribution N(c; m_i, v_i) 1(0 <= c <= w); condition the state on c.
 3. Draw the remaining components of the state.
 
-With the integral I of all sites, the weight of a trajectory is
+With the integral I of all factors, the weight of a trajectory is
 
     I prod_i  P(0 <= c_i <= w; m_i, v_i) / int N(c; m_i, v_i) t_i(c) dc.
 
-For any sites, its expectation is the probability of the constraints. Good sites reduce its variance: they inform a draw
-about the constraints at earlier rows. All trajectories share their covariances, so that each costs only its mean.
+For any factors, its expectation is the probability of the constraints. Good factors reduce its variance: they inform a
+draw about the constraints at earlier rows. All trajectories share their covariances, so that each costs only its mean.
 
 Source: Geweke (1991), Keane (1994), Econometrica 62, and Hajivassiliou, McFadden and Ruud (1996), Journal of
 Econometrics 72, for the simulator; Carter and Kohn (1994), Biometrika 81, for backward sampling.
@@ -26,12 +26,12 @@ import jax
 import jax.numpy as jnp
 
 from lfm_ppl.constrained.truncated import log_share, quantile
+from lfm_ppl.filtering.ep.factor_updates import gaussian_terms
 from lfm_ppl.filtering.ep.quadrature import MeanVariance
-from lfm_ppl.filtering.ep.site_updates import gaussian_terms
 from lfm_ppl.filtering.forward import FilterTrace
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
-from lfm_ppl.filtering.update import Sites
+from lfm_ppl.filtering.update import Factors
 from lfm_ppl.utils.linalg import congruence, diagonal, matmul, semidefinite_root
 from lfm_ppl.utils.random_keys import split_by_name
 
@@ -49,8 +49,8 @@ class FeasiblePaths(NamedTuple):
     Attributes:
         states: (N, n, S), states at the ends of the intervals.
         values: (N, B, S), constrained quantities, between 0 and their width where a constraint holds.
-        log_weights: (S,), logarithms of weights with the expectation P / I, where P is the integral of the likelihood
-            factors, and I the integral of the sites.
+        log_weights: (S,), logarithms of weights with the expectation P / I, where P is the integral of the exact
+            terms, and I the integral of the factors.
     """
 
     states: jax.Array
@@ -64,7 +64,7 @@ def sample_feasible_paths(key: jax.Array, forward_pass: FilterTrace, is_constrai
 
     Args:
         key: a JAX random key.
-        forward_pass: a complete forward scan with sites; the last B entries of its observations are the constraints.
+        forward_pass: a complete forward scan with factors; the last B entries of its observations are the constraints.
         is_constrained: (N, B), whether a constraint holds at the end of an interval.
         widths: (B,), widths of the boxes.
         count: number of trajectories S, even.
@@ -118,11 +118,11 @@ def _sample_row(mean: jax.Array, covariance: jax.Array, row: tuple,
     size, count = mean.shape
     number = is_constrained.shape[0]
     initial_variance = diagonal(covariance)
-    terms = forward_row.update.site_terms
+    terms = forward_row.update.factor_terms
     outputs = terms.value.shape[0] - number
     log_weights, values = jnp.zeros(count), []
     for index in range(number):
-        sites = Sites(*(a[outputs + index] for a in terms.sites))
+        factors = Factors(*(a[outputs + index] for a in terms.factors))
         h = forward_row.update.jacobian[outputs + index]
         gain = matmul(covariance, h[:, None])[:, 0]
         variance = (h * gain).sum()
@@ -130,17 +130,17 @@ def _sample_row(mean: jax.Array, covariance: jax.Array, row: tuple,
         predicted_variance = terms.variance[outputs + index, outputs + index]
         is_determined = ~(variance > _ROUNDING_VARIANCE * predicted_variance)
         safe_variance = jnp.where(is_determined, 1.0, variance)
-        # Divide the site out: cavity precision = 1 / variance - tau.
-        precision_ratio = jnp.maximum(1.0 - sites.tau * safe_variance, _ROUNDING_VARIANCE)
-        cavity = MeanVariance(sites.centre + (value - sites.centre - safe_variance * sites.nu) / precision_ratio,
+        # Divide the factor out: cavity precision = 1 / variance - tau.
+        precision_ratio = jnp.maximum(1.0 - factors.tau * safe_variance, _ROUNDING_VARIANCE)
+        cavity = MeanVariance(factors.centre + (value - factors.centre - safe_variance * factors.nu) / precision_ratio,
                               jnp.broadcast_to(safe_variance / precision_ratio, value.shape))
-        log_weight = log_share(cavity, widths[index]) - gaussian_terms(sites, cavity, 1.0)
-        # A determined quantity is not drawn: its weight is the indicator over the site, which the proposal contains.
+        log_weight = log_share(cavity, widths[index]) - gaussian_terms(factors, cavity, 1.0)
+        # A determined quantity is not drawn: its weight is the indicator over the factor, which the proposal contains.
         is_violated = (jnp.maximum(-value, value - widths[index])
                        > _TOLERATED_VIOLATION * jnp.sqrt(jnp.maximum(predicted_variance, 1e-300)))
-        distance = value - sites.centre
+        distance = value - factors.centre
         log_weight = jnp.where(
-            is_determined, jnp.where(is_violated, -jnp.inf, (0.5 * sites.tau * distance - sites.nu) * distance),
+            is_determined, jnp.where(is_violated, -jnp.inf, (0.5 * factors.tau * distance - factors.nu) * distance),
             log_weight)
         draw = jnp.where(is_determined, jnp.clip(value, 0.0, widths[index]),
                          quantile(cavity, widths[index], uniforms[index]))

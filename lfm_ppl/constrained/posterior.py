@@ -1,7 +1,7 @@
-"""The posterior under constraints: expectation propagation with truncated normal sites.
+"""The posterior under constraints: expectation propagation with truncated normal factors.
 
 1. Combine the constraints into boxes 0 <= c <= width, and lay out rows of observations and constraints.
-2. Run expectation propagation with one site for each box and row of the grid (`lfm_ppl.constrained.evidence`).
+2. Run expectation propagation with one factor for each box and row of the grid (`lfm_ppl.constrained.evidence`).
 3. A backward pass gives the posterior moments. The cavity of a box, truncated to the box, gives intervals that respect
    the bounds.
 4. Draws are chosen by their weights among trajectories that respect all constraints
@@ -32,7 +32,7 @@ from lfm_ppl.constrained.truncated import quantile
 from lfm_ppl.filtering.arguments import as_rule, check_observations, warn_single_precision
 from lfm_ppl.filtering.backward import backward
 from lfm_ppl.filtering.ep.quadrature import MeanVariance
-from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.filtering.forward import FilterTrace
 from lfm_ppl.filtering.moments import Record
 from lfm_ppl.filtering.problem import at_intervals
@@ -59,7 +59,7 @@ class ConstrainedPosterior(eqx.Module):
         state_mean, state_sd: (K, M), moments of the physical state.
         force_mean, force_sd: (K, R), moments of the forces.
         sweeps: number of passes of expectation propagation.
-        converged: whether the sites have converged.
+        converged: whether the factors have converged.
     """
 
     times: jax.Array
@@ -142,7 +142,7 @@ def constrained_posterior(model: LatentForceModel, times: ArrayLike, y: ArrayLik
                           rule: Rule | None = None, steps: int = 10, sweeps: int = 200) -> ConstrainedPosterior:
     r"""Approximate the posterior of state and forces under constraints by expectation propagation.
 
-    At every time of the grid a Gaussian site approximates the factor 1(c >= 0), such that the marginal of c has the
+    At every time of the grid a Gaussian factor approximates the term 1(c >= 0), such that the marginal of c has the
     mean and the variance of the truncated normal distribution N(c; cavity) 1(c >= 0).
 
     Args:
@@ -166,7 +166,7 @@ def constrained_posterior(model: LatentForceModel, times: ArrayLike, y: ArrayLik
             function.
 
     Warns:
-        UserWarning: the sites have not converged.
+        UserWarning: the factors have not converged.
 
     Example:
         >>> import jax.numpy as jnp, numpy as np, lfm_ppl as lfm
@@ -190,7 +190,7 @@ def constrained_posterior(model: LatentForceModel, times: ArrayLike, y: ArrayLik
     y = check_observations(y, np.shape(times)[0], len(model.output_names))
     variance = check_variances(model, np.shape(times)[0])
     warn_single_precision()
-    posterior = TruncatedPosterior(ssm, as_rule(rule), scan_grid, rows, boxes, variance, SiteSettings(sweeps=sweeps))
+    posterior = TruncatedPosterior(ssm, as_rule(rule), scan_grid, rows, boxes, variance, FactorSettings(sweeps=sweeps))
     moments, proposal = _approximate(posterior, y)
     result = ConstrainedPosterior(*(*moments, boxes, posterior, proposal, model.state_names, model.force_names))
     if not checks.traced(result.converged) and not bool(result.converged):

@@ -35,13 +35,13 @@ the smoothed variance is not positive."""
 
 
 class SmoothedPredictor(NamedTuple):
-    """A family's predictor given all sites, and its law given the sites of all other entries.
+    """A family's predictor given all factors, and its law given the factors of all other entries.
 
     Attributes:
         mean: (N, D).
         covariance: (N, D, D).
         score: u (N, D).
-        precision: C (N, D, D): a site given all others is N(z - C^-1 u, C^-1).
+        precision: C (N, D, D): a factor given all others is N(z - C^-1 u, C^-1).
     """
 
     mean: jax.Array
@@ -60,7 +60,7 @@ class SmootherTrace(NamedTuple):
             the entry is missing, and (N,) of a pass without leave-one-out terms.
         adjoint: r (N, n) and Lambda (N, n, n) at the interval's end, its observation and all later ones included: the
             smoothed mean there is m_p + P_p r, the covariance P_p - P_p Lambda P_p.
-        predictor: (N, ...), of a pass with sites, which has no leave-one-out terms; None of any other.
+        predictor: (N, ...), of a pass with factors, which has no leave-one-out terms; None of any other.
     """
 
     moments: Moments
@@ -95,7 +95,7 @@ def backward(problem: FilterProblem, trace: FilterTrace, adjoint_only: bool = Fa
         filtered, interval, skip = row
         update, predicted = interval.update, interval.predicted
         left_out, predictor = (jnp.zeros(()), jnp.zeros(())), None
-        if update.site_terms is not None:
+        if update.factor_terms is not None:
             predictor = _smoothed_predictor(update, predicted, r, adjoint)
         elif not adjoint_only:
             left_out = _leave_one_out(update, r, adjoint)
@@ -121,15 +121,15 @@ def backward(problem: FilterProblem, trace: FilterTrace, adjoint_only: bool = Fa
 
 
 def _smoothed_predictor(update: Update, predicted: Moments, r: jax.Array, adjoint: jax.Array) -> SmoothedPredictor:
-    """Return the predictor at an interval's end given all sites.
+    """Return the predictor at an interval's end given all factors.
 
     With M = (I + T F)^-1 and r and Lambda of what comes later, the predictor has the mean f + F S^-1 v + M' H P r and
-    the covariance F M - M' H P Lambda P H' M: no difference of variances that are larger than the site leaves them.
+    the covariance F M - M' H P Lambda P H' M: no difference of variances that are larger than the factor leaves them.
 
     A predicted variance that is a rounding error of the sum H P H', as that of a conserved sum of uncertain states, is
     reported as zero: its sign is random.
     """
-    terms, jacobian = update.site_terms, update.jacobian
+    terms, jacobian = update.factor_terms, update.jacobian
     assert terms is not None
     score = terms.score - matvec(update.gain.T, r)
     precision = terms.precision + congruence(update.gain.T, adjoint)
@@ -145,9 +145,9 @@ def _smoothed_predictor(update: Update, predicted: Moments, r: jax.Array, adjoin
 
 
 def _whitened(update: Update) -> tuple[jax.Array, jax.Array]:
-    """Return S^-1 (D, D) and S^-1 v (D,), or their counterparts of an update by sites."""
-    if update.site_terms is not None:
-        return update.site_terms.precision, update.site_terms.score
+    """Return S^-1 (D, D) and S^-1 v (D,), or their counterparts of an update by factors."""
+    if update.factor_terms is not None:
+        return update.factor_terms.precision, update.factor_terms.score
     inverse = outer_square(solve_lower(update.chol, jnp.eye(update.innovation.shape[0])).T)
     return inverse, matvec(inverse, update.innovation)
 

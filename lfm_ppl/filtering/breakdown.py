@@ -17,7 +17,7 @@ import numpy as np
 from lfm_ppl.filtering.ep.evidence import refine
 from lfm_ppl.filtering.ep.fixed_point import FixedPoint
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
-from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.integrators.integrator import Stepping
@@ -47,15 +47,15 @@ _LARGEST_LOG_LIKELIHOOD_CHANGE = 0.5
 
 
 class FilterWarning(UserWarning):
-    """The filter breaks down, its log likelihood is -inf, or sites or iterations do not converge.
+    """The filter breaks down, its log likelihood is -inf, or factors or iterations do not converge.
 
     The message says where and how.
     """
 
 
 def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: Moments | None,
-                      log_likelihood: Any, sites: SiteSettings | None = None, converged: Any = True) -> None:
-    """Warn where a log likelihood is not finite or sites have not converged; nothing happens in compiled code.
+                      log_likelihood: Any, factors: FactorSettings | None = None, converged: Any = True) -> None:
+    """Warn where a log likelihood is not finite or factors have not converged; nothing happens in compiled code.
 
     Args:
         ssm: the model.
@@ -64,8 +64,8 @@ def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, 
         y: (T, D), NaN where missing.
         start: moments at the initial time; the model's by default.
         log_likelihood: result of the filter, of any shape.
-        sites: settings of the sites of an observation family; None for assumed density filtering.
-        converged: whether the sites have converged.
+        factors: settings of the factors of an observation family; None for assumed density filtering.
+        converged: whether the factors have converged.
     """
     if checks.traced((ssm, grid, y, start, log_likelihood, converged)):
         return
@@ -73,7 +73,7 @@ def warn_of_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, 
     if is_finite and np.all(converged):
         return
     if isinstance(ssm.model.observation, ObservationFamily):
-        checks.warn(family_breakdown(ssm, rule, grid, y, sites, start, is_finite), FilterWarning)
+        checks.warn(family_breakdown(ssm, rule, grid, y, factors, start, is_finite), FilterWarning)
         return
     checks.warn(breakdown(ssm, rule, grid, y, start) or "the log likelihood is -inf, but the filter does not break "
                 "down without posterior linearisation: try iterations=0, or a smaller damping, such as damping=0.5.",
@@ -99,14 +99,14 @@ def warn_of_iterations(change: Any, log_likelihood_change: Any) -> None:
                 "damping=0.3, or a single pass (iterations=0), and compare with lfm.check_accuracy.", FilterWarning)
 
 
-def family_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, settings: SiteSettings | None,
+def family_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, settings: FactorSettings | None,
                      start: Moments | None = None, is_finite: bool = False) -> str:
-    """Return why the log likelihood of an observation family is not finite, or its sites do not converge.
+    """Return why the log likelihood of an observation family is not finite, or its factors do not converge.
 
     Arguments must be concrete.
     """
-    remedy = ("Try a smaller share of each new site, sites=lfm.SiteSettings(damping=0.5), half powers, "
-              "sites=lfm.SiteSettings(power=0.5), or a tighter prior")
+    remedy = ("Try a smaller share of each new factor, factors=lfm.FactorSettings(damping=0.5), half powers, "
+              "factors=lfm.FactorSettings(power=0.5), or a tighter prior")
     y = jnp.asarray(y, float)
     family = ssm.model.observation
     assert isinstance(family, ObservationFamily)
@@ -117,15 +117,15 @@ def family_breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, s
         return ("the log likelihood of the observation family is -inf: the data are impossible under the prediction, "
                 "or the filter breaks down. Try a tighter prior, or more steps (steps=...).")
     fixed_point = _run_refine(ssm, rule, grid, FamilyTerms(family, y), settings, initial)
-    is_bad = ~np.asarray(fixed_point.cavity.valid) | ~np.isfinite(np.asarray(fixed_point.sites.tau))
+    is_bad = ~np.asarray(fixed_point.cavity.valid) | ~np.isfinite(np.asarray(fixed_point.factors.tau))
     where = ""
     if is_bad.any():
         row, column = np.argwhere(is_bad)[0]
         where = f"; the first without a cavity is y[{row}, {column}]"
     if bool(fixed_point.converged):
-        return f"the log likelihood of the observation family is not finite, although its sites converge. {remedy}."
-    return (f"the sites of the observation family do not converge in {int(fixed_point.sweeps)} sweeps (the last "
-            f"changes a site by {float(fixed_point.change):.2g}){where}. The log likelihood is "
+        return f"the log likelihood of the observation family is not finite, although its factors converge. {remedy}."
+    return (f"the factors of the observation family do not converge in {int(fixed_point.sweeps)} sweeps (the last "
+            f"changes a factor by {float(fixed_point.change):.2g}){where}. The log likelihood is "
             f"{'that of assumed density filtering, which is rougher' if is_finite else '-inf'}. {remedy}.")
 
 
@@ -161,7 +161,7 @@ def _explain_row(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array,
 
 
 @shared_jit
-def _run_refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, terms: FamilyTerms, settings: SiteSettings,
+def _run_refine(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, terms: FamilyTerms, settings: FactorSettings,
                 start: Moments) -> FixedPoint:
     return refine(filter_problem(ssm, rule, grid), terms, settings, start).fixed_point
 

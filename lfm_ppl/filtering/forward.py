@@ -5,7 +5,7 @@ For each interval of the time grid, in one fused scan,
 1. predict the moments over the interval, by the integrator of the problem or by a given affine map;
 2. let the forces jump, where they do, and apply the event at its end;
 3. linearise the observation about the predicted moments, or about given ones;
-4. update the moments by an `Updater`: a Gaussian observation, Gaussian sites, or sites by moment matching;
+4. update the moments by an `Updater`: a Gaussian observation, Gaussian factors, or factors by moment matching;
 5. record what the caller asks for (`Record`).
 
 The body of the scan is checkpointed, which matters in reverse mode only: of each interval, the derivative stores its
@@ -78,7 +78,7 @@ class FilterTrace(NamedTuple):
         phi, process_cov: (N, n, n), affine map of the interval.
         update: of the observation; None for `Record.LIKELIHOOD`, without gains for `Record.MOMENTS`.
         nodes: `NodeRecord` of the steps, for `Record.LINEARIZATION`.
-        predictor: (N, D), predicted mean of an observation family's predictor, of any update by sites.
+        predictor: (N, D), predicted mean of an observation family's predictor, of any update by factors.
     """
 
     initial: Any
@@ -119,7 +119,7 @@ def forward(problem: FilterProblem, updater: Updater, *, initial: Moments | None
                                         interval_map.mean)
         centre = None if points is None else points.end_moments
         updated = update_at_end(problem, update, interval, row, prediction.moments, centre)
-        terms = updated.site_terms
+        terms = updated.factor_terms
         trace = FilterTrace(None, updated.log_likelihood, predictor=None if terms is None else terms.value)
         if record is not Record.LIKELIHOOD:
             trace = trace._replace(predicted=prediction.moments, filtered=updated.moments,

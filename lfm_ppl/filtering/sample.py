@@ -9,7 +9,7 @@
 
        r = H' S^-1 v + (I - K H)' r',    s+ - E[s+ | y+] = e_p - P_p r.
 
-3. Sites of positive precision are observations of variance 1 / tau. With a negative precision, states are drawn from
+3. Factors of positive precision are observations of variance 1 / tau. With a negative precision, states are drawn from
    the last to the first instead, each given the next one.
 
 No covariance of a state is inverted, so that a known state, or fewer noises than states, does no harm. All draws share
@@ -49,12 +49,12 @@ def sample_errors(key: jax.Array, trace: FilterTrace, draws: int) -> jax.Array:
         draws: number of draws.
     """
     keys = split_by_name(key, ("initial", "process", "observation", "backwards"))
-    site_terms = trace.update.site_terms
-    if site_terms is None:
+    factor_terms = trace.update.factor_terms
+    if factor_terms is None:
         return _sample_by_simulation(keys, trace, draws)
-    is_negative = (site_terms.sites.tau < 0).any()
+    is_negative = (factor_terms.factors.tau < 0).any()
     return jax.lax.cond(is_negative, lambda: _sample_backwards(keys["backwards"], trace, draws),
-                        lambda: _sample_by_simulation(keys, _sites_as_observations(trace), draws))
+                        lambda: _sample_by_simulation(keys, _factors_as_observations(trace), draws))
 
 
 def _sample_by_simulation(keys: Mapping[str, jax.Array], trace: FilterTrace, draws: int) -> jax.Array:
@@ -88,19 +88,19 @@ def _sample_by_simulation(keys: Mapping[str, jax.Array], trace: FilterTrace, dra
     return deviations
 
 
-def _sites_as_observations(trace: FilterTrace) -> FilterTrace:
-    """Return a pass with sites of non-negative precision as a pass with observations of variances 1 / tau."""
+def _factors_as_observations(trace: FilterTrace) -> FilterTrace:
+    """Return a pass with factors of non-negative precision as a pass with observations of variances 1 / tau."""
 
     def row(interval: FilterTrace) -> FilterTrace:
         update = interval.update
-        terms = update.site_terms
-        present = terms.sites.tau > 0
-        variance = jnp.diag(1.0 / jnp.where(present, terms.sites.tau, 1.0))
+        terms = update.factor_terms
+        present = terms.factors.tau > 0
+        variance = jnp.diag(1.0 / jnp.where(present, terms.factors.tau, 1.0))
         _, obs_cov = masked(terms.value, terms.residual_cov + variance, present)
         jacobian = jnp.where(present[:, None], update.jacobian, 0.0)
         chol = cholesky(congruence(jacobian, interval.predicted.covariance) + obs_cov).chol
         return interval._replace(
-            update=update._replace(chol=chol, obs_cov=obs_cov, jacobian=jacobian, site_terms=None))
+            update=update._replace(chol=chol, obs_cov=obs_cov, jacobian=jacobian, factor_terms=None))
 
     return jax.vmap(row)(trace._replace(initial=None, nodes=None))._replace(initial=trace.initial)
 
@@ -108,8 +108,8 @@ def _sites_as_observations(trace: FilterTrace) -> FilterTrace:
 def _sample_backwards(key: jax.Array, trace: FilterTrace, draws: int) -> jax.Array:
     """Draw deviations as `sample_errors` does, from the last interval to the first, each state given the next.
 
-    With sites of negative precision a filtered covariance may be indefinite, but that of a state given the next one
-    and all sites is not.
+    With factors of negative precision a filtered covariance may be indefinite, but that of a state given the next one
+    and all factors is not.
     """
     rows, size = trace.phi.shape[:2]
     standard = jax.random.normal(key, (rows, size, draws))

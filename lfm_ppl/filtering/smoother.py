@@ -2,7 +2,7 @@
 
 1. Observation times and requested times are the nodes of one time grid (`time_grid`).
 2. The model is linearised about the filter's moments, about iterated posterior moments, or about the moments that
-   the sites of an observation family give.
+   the factors of an observation family give.
 3. One forward and one backward scan give the smoothed moments at all nodes; draws come from the same forward scan.
 
 Source: Särkkä and Sarmavuori (2013), Signal Processing 93.
@@ -23,7 +23,7 @@ from lfm_ppl.filtering.backward import backward
 from lfm_ppl.filtering.breakdown import warn_of_breakdown, warn_of_iterations
 from lfm_ppl.filtering.ep.evidence import entry_leave_one_out, evidence, leave_one_out
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter, quantile_residuals
-from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
+from lfm_ppl.filtering.ep.settings import FactorSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.filter import whitened_innovations
 from lfm_ppl.filtering.forward import FilterTrace, forward
@@ -82,8 +82,8 @@ class SmootherResult(eqx.Module):
         change: largest change of a smoothed mean in the last iteration, in smoothed standard deviations; NaN
             with fewer than two iterations.
         log_likelihood_change: change of the sum of ``log_likelihood`` in the last iteration; NaN with fewer than two.
-        converged: whether the sites of an observation family have converged; true where there are none. Where they
-            have not, a model that is not linear is smoothed with the sites of assumed density filtering, and
+        converged: whether the factors of an observation family have converged; true where there are none. Where they
+            have not, a model that is not linear is smoothed with the factors of assumed density filtering, and
             ``leave_one_out`` is ``log_likelihood``, divided equally among the entries of a row; in a linear model all
             are -inf.
     """
@@ -166,7 +166,7 @@ def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
 
 def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule | None = None, steps: int = 10,
            max_step: float | None = None, at: ArrayLike | None = None, iterations: int | None = None,
-           damping: float = 0.7, tolerance: float | None = None, sites: SiteSettings | str | None = None,
+           damping: float = 0.7, tolerance: float | None = None, factors: FactorSettings | str | None = None,
            method: str = DEFAULT_METHOD) -> SmootherResult:
     """Smooth: the state and the forces given all observations.
 
@@ -188,8 +188,8 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         damping: largest fraction of each new iterate that is taken, in (0, 1]; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
         method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
-        sites: of an observation family, how its sites are refined: "ep" (the default), "variational", "laplace", or
-            `lfm_ppl.SiteSettings`.
+        factors: of an observation family, how its factors are refined: "ep" (the default), "variational", "laplace", or
+            `lfm_ppl.FactorSettings`.
 
     Returns:
         Moments at the requested times, forces by name, draws of trajectories, diagnostics.
@@ -217,7 +217,7 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     check_iterations(iterations, damping, tolerance)
     ssm = state_space(model)
     iterations = number_of_iterations(iterations, ssm, tolerance)
-    settings = as_settings(sites, iterations)
+    settings = as_settings(factors, iterations)
     grid = build_time_grid(ssm, times, steps, max_step, at, tolerance=tolerance)._replace(method=method)
     model.check_at(grid.initial_time, np.shape(times)[0])
     check_resolution(model, times, y)
@@ -237,7 +237,7 @@ def filtered_mean(result: SmootherResult, grid: TimeGrid) -> jax.Array:
 
 
 def smooth_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int, damping: float,
-              settings: SiteSettings) -> SmootherResult:
+              settings: FactorSettings) -> SmootherResult:
     """Smooth on the intervals of a time grid, without checks; for compiled code."""
     problem = filter_problem(ssm, rule, grid)
     if isinstance(ssm.model.observation, ObservationFamily):
@@ -273,7 +273,7 @@ def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int,
         "log_likelihood_change": at_data.log_likelihood.sum() - previous, "converged": jnp.asarray(True)}
 
 
-def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings,
+def _smooth_family(problem: FilterProblem, y: jax.Array, settings: FactorSettings,
                    family: ObservationFamily) -> tuple[FilterTrace, Moments, dict[str, jax.Array]]:
     """Return the results of `_smooth_gaussian` for an observation family, with randomised quantile residuals."""
     result = evidence(problem, FamilyTerms(family, y), settings, record=Record.SMOOTHER)
@@ -282,10 +282,10 @@ def _smooth_family(problem: FilterProblem, y: jax.Array, settings: SiteSettings,
     predictor = at_intervals(smoothed.predictor, problem.grid.observed)
     prequential = assumed_density_filter(problem, y)
     fallback = jnp.full(len(y), -jnp.inf) if points is None else prequential.log_likelihood
-    left_out = leave_one_out(predictor, fixed_point.sites, result.entries)
+    left_out = leave_one_out(predictor, fixed_point.factors, result.entries)
     one_step_ahead, left_out = (jnp.where(fixed_point.converged, value, fallback)
                                 for value in (prequential.log_likelihood, left_out))
-    entries = entry_leave_one_out(predictor, fixed_point.sites, result.entries)
+    entries = entry_leave_one_out(predictor, fixed_point.factors, result.entries)
     counts = jnp.maximum(jnp.isfinite(y).sum(axis=1), 1)
     entries = jnp.where(fixed_point.converged, entries, (fallback / counts)[:, None])
     change = jnp.asarray(jnp.nan) if points is None else fixed_point.change

@@ -1,13 +1,13 @@
-"""Updates: condition the predicted moments on one observation, or multiply them with Gaussian sites.
+"""Updates: condition the predicted moments on one observation, or multiply them with Gaussian factors.
 
 1. `linearize_observation` gives the observation as an affine map of the state.
 2. An `Updater` turns that map, the row's data and the predicted moments into an `Update`: `GaussianUpdate` conditions
-   on a Gaussian observation, `SiteUpdate` multiplies with given sites, and `MomentMatchingUpdate` of
-   `lfm_ppl.filtering.ep.moment_matching` computes the sites of a row from its prediction.
+   on a Gaussian observation, `FactorUpdate` multiplies with given factors, and `MomentMatchingUpdate` of
+   `lfm_ppl.filtering.ep.moment_matching` computes the factors of a row from its prediction.
 3. Covariances are in Joseph's form. The log likelihood is -inf where the innovation covariance is not positive definite
    to working precision, or where the filtered moments of an output are rounding errors.
 
-Source: Särkkä (2013), Bayesian Filtering and Smoothing, chapters 4 to 6; Minka (2001) for the sites.
+Source: Särkkä (2013), Bayesian Filtering and Smoothing, chapters 4 to 6; Minka (2001) for the factors.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ class LinearizedObservation(NamedTuple):
         return self._replace(value=self.value + matvec(self.jacobian, change))
 
 
-class Sites(NamedTuple):
-    """Gaussian sites of the predictor f, unnormalised: exp(nu (f - c) - tau (f - c)^2 / 2) for each entry.
+class Factors(NamedTuple):
+    """Gaussian factors of the predictor f, unnormalised: exp(nu (f - c) - tau (f - c)^2 / 2) for each entry.
 
     The parameters are natural ones, and tau may be negative. The point c only keeps numbers small.
 
@@ -81,8 +81,8 @@ class Sites(NamedTuple):
     tau: jax.Array
 
 
-class SiteTerms(NamedTuple):
-    """What the backward scan needs of an update by sites; f = value + H (s - m_p) + e, e ~ N(0, residual_cov).
+class FactorTerms(NamedTuple):
+    """What the backward scan needs of an update by factors; f = value + H (s - m_p) + e, e ~ N(0, residual_cov).
 
     Attributes:
         value: (D,), the predicted mean of f.
@@ -91,7 +91,7 @@ class SiteTerms(NamedTuple):
         shrinkage: (I + T F)^-1 (D, D), with T = diag(tau).
         precision: (I + T F)^-1 T (D, D), the S^-1 of an observation.
         score: (I + T F)^-1 (nu - T (value - c)) (D,), the S^-1 v of an observation.
-        sites: the sites.
+        factors: the factors.
     """
 
     value: jax.Array
@@ -100,14 +100,14 @@ class SiteTerms(NamedTuple):
     shrinkage: jax.Array
     precision: jax.Array
     score: jax.Array
-    sites: Sites
+    factors: Factors
 
 
 class Update(NamedTuple):
     """Filtered moments and what the smoother and the diagnostics need.
 
     An update returns either ``chol``, ``obs_cov`` and ``present`` (as `condition` does for Gaussian noise) or
-    ``site_terms`` (as `multiply_by_sites` does; an updater that has sites calls it and replaces the log likelihood).
+    ``factor_terms`` (as `multiply_by_factors` does; an updater with factors calls it and replaces the log likelihood).
 
     Attributes:
         moments: given the observation.
@@ -115,10 +115,10 @@ class Update(NamedTuple):
         innovation: (D,), zero where missing.
         gain: (n, D).
         jacobian: (D, n), zero rows where missing.
-        chol: (D, D), Cholesky factor of the innovation covariance, the identity where missing; None with sites.
-        obs_cov: (D, D), covariance of the observation given the state, the identity where missing; None with sites.
-        present: (D,), whether an entry is present; None with sites.
-        site_terms: of an update by sites; None otherwise.
+        chol: (D, D), Cholesky factor of the innovation covariance, the identity where missing; None with factors.
+        obs_cov: (D, D), covariance of the observation given the state, the identity where missing; None with factors.
+        present: (D,), whether an entry is present; None with factors.
+        factor_terms: of an update by factors; None otherwise.
     """
 
     moments: Any
@@ -129,7 +129,7 @@ class Update(NamedTuple):
     chol: Any = None
     obs_cov: Any = None
     present: Any = None
-    site_terms: SiteTerms | None = None
+    factor_terms: FactorTerms | None = None
 
 
 RowUpdate = Callable[[LinearizedObservation, jax.Array, Any, Moments], Update]
@@ -180,24 +180,24 @@ class GaussianUpdate(NamedTuple):
         return update
 
 
-class SiteUpdate(NamedTuple):
-    """Multiply with given sites.
+class FactorUpdate(NamedTuple):
+    """Multiply with given factors.
 
     Attributes:
-        sites: (T, D) each.
+        factors: (T, D) each.
     """
 
-    sites: Sites
+    factors: Factors
 
     def rows(self) -> jax.Array:
-        """Return the sites as one array (T, 3, D)."""
-        return jnp.stack(self.sites, axis=1)
+        """Return the factors as one array (T, 3, D)."""
+        return jnp.stack(self.factors, axis=1)
 
     def bind(self, problem: FilterProblem, initial: Moments) -> RowUpdate:
         """Return the update of one row."""
 
         def update(observation: LinearizedObservation, index: jax.Array, row: jax.Array, predicted: Moments) -> Update:
-            return multiply_by_sites(observation, Sites(*jnp.where(jnp.isnan(row), 0.0, row)), predicted)
+            return multiply_by_factors(observation, Factors(*jnp.where(jnp.isnan(row), 0.0, row)), predicted)
 
         return update
 
@@ -309,8 +309,8 @@ def predictor_variance(observation: LinearizedObservation, moments: Moments) -> 
     return congruence(observation.jacobian, moments.covariance) + observation.obs_cov
 
 
-def multiply_by_sites(observation: LinearizedObservation, sites: Sites, predicted: Moments) -> Update:
-    r"""Multiply the predicted moments with Gaussian sites in natural parameters.
+def multiply_by_factors(observation: LinearizedObservation, factors: Factors, predicted: Moments) -> Update:
+    r"""Multiply the predicted moments with Gaussian factors in natural parameters.
 
     With f ~ N(m, F) as predicted and d = f - c,
 
@@ -322,7 +322,7 @@ def multiply_by_sites(observation: LinearizedObservation, sites: Sites, predicte
 
     Args:
         observation: the predictor, linearised about the predicted moments; ``obs_cov`` is its residual covariance.
-        sites: (D,) each.
+        factors: (D,) each.
         predicted: predicted moments.
 
     Returns:
@@ -334,17 +334,17 @@ def multiply_by_sites(observation: LinearizedObservation, sites: Sites, predicte
     jacobian, residual_cov = observation.jacobian, observation.obs_cov
     cross = matmul(covariance, jacobian.T)
     variance = symmetric(matmul(jacobian, cross)) + residual_cov
-    offset = observation.value - sites.centre
-    shrinkage, log_det = inverse_and_log_det(jnp.eye(offset.shape[0]) + sites.tau[:, None] * variance)
-    precision = symmetric(shrinkage * sites.tau[None, :])
-    slope = sites.nu - sites.tau * offset
+    offset = observation.value - factors.centre
+    shrinkage, log_det = inverse_and_log_det(jnp.eye(offset.shape[0]) + factors.tau[:, None] * variance)
+    precision = symmetric(shrinkage * factors.tau[None, :])
+    slope = factors.nu - factors.tau * offset
     score = matvec(shrinkage, slope)
     gain = matmul(cross, precision)
     i_kh = jnp.eye(mean.shape[0]) - matmul(gain, jacobian)
     gain_factor = matmul(cross, shrinkage)
     filtered = Moments(mean + matvec(cross, score),
-                       congruence(i_kh, covariance) + symmetric(matmul(gain_factor * sites.tau, gain_factor.T))
+                       congruence(i_kh, covariance) + symmetric(matmul(gain_factor * factors.tau, gain_factor.T))
                        + congruence(gain, residual_cov))
-    log_integral = 0.5 * ((sites.nu * (offset + matvec(variance, score)) + score * offset).sum() - log_det)
-    terms = SiteTerms(observation.value, variance, residual_cov, shrinkage, precision, score, sites)
-    return Update(filtered, log_integral, slope, gain, jacobian, site_terms=terms)
+    log_integral = 0.5 * ((factors.nu * (offset + matvec(variance, score)) + score * offset).sum() - log_det)
+    terms = FactorTerms(observation.value, variance, residual_cov, shrinkage, precision, score, factors)
+    return Update(filtered, log_integral, slope, gain, jacobian, factor_terms=terms)

@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 
 _BASE = 4.0
-"""Largest expected number of events in the series of a matrix exponential, before squaring."""
+"""Largest expected number of jumps in the series of a matrix exponential, before squaring."""
 
 _TERMS = 36
-"""Terms of this series; the Poisson(4) probability of more events is below 1e-21."""
+"""Terms of this series; the Poisson(4) probability of more jumps is below 1e-21."""
 
-_EVENTS_PER_SERIES = 400.0
-"""Largest expected number of events of one series for the action on masses; exp(-400) does not underflow."""
+_JUMPS_PER_SERIES = 400.0
+"""Largest expected number of jumps of one series for the action on masses; exp(-400) does not underflow."""
 
 _SMALLEST = 1e-280
 """Smaller transition probabilities are set to zero, because arithmetic with subnormal numbers is slow."""
@@ -131,9 +131,9 @@ def transition(process: BirthDeathProcess, length: jax.Array) -> jax.Array:
     """
     size = process.up.shape[-1]
     fastest_rate = jnp.max(process.up + process.down)
-    events = fastest_rate * length
-    squarings = _count(jnp.log2(jnp.maximum(events / _BASE, 1.0)), 60)
-    theta = events / 2.0**squarings
+    jumps = fastest_rate * length
+    squarings = _count(jnp.log2(jnp.maximum(jumps / _BASE, 1.0)), 60)
+    theta = jumps / 2.0**squarings
     up, down, stay = _event_probabilities(process, fastest_rate)
     index = np.arange(_TERMS + 1)
     log_factorial = np.append(0.0, np.cumsum(np.log(index[1:])))
@@ -165,9 +165,9 @@ def propagate(process: BirthDeathProcess, length: jax.Array, masses: jax.Array, 
         masses: (..., N), >= 0.
         adjoint: propagate a function of the cell backwards instead.
     """
-    events = jnp.max(process.up + process.down) * length
-    # Number of events for which the series takes as long as the matrix: measured 6000 for 200 cells, 55,000 for 500.
-    use_matrix = events > 6000.0 * (process.up.shape[-1] / 200.0) ** 2.4
+    jumps = jnp.max(process.up + process.down) * length
+    # Number of jumps for which the series takes as long as the matrix: measured 6000 for 200 cells, 55,000 for 500.
+    use_matrix = jumps > 6000.0 * (process.up.shape[-1] / 200.0) ** 2.4
 
     def by_matrix(m: jax.Array) -> jax.Array:
         matrix = transition(process, length)
@@ -177,15 +177,15 @@ def propagate(process: BirthDeathProcess, length: jax.Array, masses: jax.Array, 
         # Under vmap both branches run: with length zero the series ends at once if the matrix is used.
         return _apply_series(process, jnp.where(use_matrix, 0.0, length), m, adjoint)
 
-    return jnp.where(jnp.isnan(events), jnp.nan, jax.lax.cond(use_matrix, by_matrix, by_series, masses))
+    return jnp.where(jnp.isnan(jumps), jnp.nan, jax.lax.cond(use_matrix, by_matrix, by_series, masses))
 
 
 def _apply_series(process: BirthDeathProcess, length: jax.Array, masses: jax.Array, adjoint: bool) -> jax.Array:
-    """Apply the series to masses, in sub-intervals of at most `_EVENTS_PER_SERIES` expected events."""
+    """Apply the series to masses, in sub-intervals of at most `_JUMPS_PER_SERIES` expected jumps."""
     fastest_rate = jnp.max(process.up + process.down)
-    events = fastest_rate * length
-    substeps = _count(events / _EVENTS_PER_SERIES, 10**9)
-    theta = events / jnp.maximum(substeps, 1)
+    jumps = fastest_rate * length
+    substeps = _count(jumps / _JUMPS_PER_SERIES, 10**9)
+    theta = jumps / jnp.maximum(substeps, 1)
     # Nine standard deviations above the mean of the Poisson distribution.
     terms = _count(theta + 9.0 * jnp.sqrt(theta) + 20.0, 10**4)
     up, down, stay = _event_probabilities(process, fastest_rate)
@@ -239,7 +239,7 @@ def _gaussian_masses(edges: jax.Array, mean: jax.Array, variance: jax.Array) -> 
 
 def _event_probabilities(process: BirthDeathProcess,
                          fastest_rate: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the probabilities (N,) of moving up, down and staying in one event of the uniformised process."""
+    """Return the probabilities (N,) of moving up, down and staying at one jump time of the uniformised process."""
     rate = jnp.where(fastest_rate > 0, fastest_rate, jnp.where(jnp.isnan(fastest_rate), fastest_rate, 1.0))
     up, down = process.up / rate, process.down / rate
     return up, down, jnp.maximum(1.0 - up - down, 0.0)

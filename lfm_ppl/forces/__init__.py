@@ -15,9 +15,7 @@ from lfm_ppl.forces.periodic_kernels import (
 from lfm_ppl.forces.quasi_periodic import Periodic, QuasiPeriodic, significant_functions
 from lfm_ppl.forces.random_walk import RandomWalk
 from lfm_ppl.forces.resonator import Resonator
-from lfm_ppl.forces.resonators import resonators
 from lfm_ppl.forces.sde import ApproximationWarning, Force, Stack, Sum
-from lfm_ppl.forces.sparse_spectrum import SparseSpectrum, random_frequencies
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.forces.weights import CQM, SQM, WQM, change_points
 from lfm_ppl.forces.wiener_velocity import WienerVelocity
@@ -38,14 +36,11 @@ __all__ = [
     "RandomWalk",
     "Resonator",
     "SQM",
-    "SparseSpectrum",
     "SquaredExponential",
     "Stack",
     "Sum",
     "WQM",
     "WienerVelocity",
     "change_points",
-    "random_frequencies",
-    "resonators",
     "significant_functions",
 ]

@@ -71,7 +71,7 @@ def _series_failure(member: SeriesLikelihood, y: Any) -> str:
     if isinstance(member, Switching):
         return member.breakdown(member.checked(y))
     if member.is_family:
-        return family_breakdown(member.ssm, member.settings.rule, member.time_grid, y, member.site_settings)
+        return family_breakdown(member.ssm, member.settings.rule, member.time_grid, y, member.factor_settings)
     return breakdown(member.ssm, member.settings.rule, member.time_grid, y) or (
         "the likelihood is not finite, though the filter does not break down without posterior linearisation: try "
         "iterations=0.")

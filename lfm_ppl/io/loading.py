@@ -41,6 +41,7 @@ from typing import Any
 
 from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, OF_SERIES, Data
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.shipped_files import shipped_folder
 
 _MODULE = "_lfm_ppl_model_"  # prefix of the names of the modules of model files
 
@@ -157,8 +158,7 @@ class ModelFile:
 
 def models_folder() -> Path:
     """Return the folder of the shipped model files: in a wheel, or in the checkout."""
-    package = Path(__file__).resolve().parent.parent
-    return package / "_models" if (package / "_models").is_dir() else package.parent / "models"
+    return shipped_folder("models")
 
 
 def available() -> dict[str, Path]:

@@ -44,8 +44,8 @@ class LaplaceResult(eqx.Module):
         log_joint: psi at the mode, log p(y | v) - v'v/2.
         gradient: largest absolute entry of the gradient of psi at the mode, in white coordinates.
         iterations: number of steps.
-        stopped: whether the search met its stopping rule: a step changed psi, or in a trust region was predicted to
-            change it, by less than the tolerance; for Newton's method also if no step length increased psi.
+        stopped: whether the search met its stopping criterion: a step changed psi, or in a trust region was predicted
+            to change it, by less than the tolerance; for Newton's method also if no step length increased psi.
         converged: whether the point is a mode: the gradient is below 1e-3 and H is positive definite. With a large
             tolerance the search may stop before.
     """
@@ -76,7 +76,7 @@ class LaplaceIterate(NamedTuple):
         value: psi at v.
         damping: Levenberg and Marquardt's damping; not used by Newton's method.
         iterations: number of steps so far.
-        stopped: whether the search met its stopping rule.
+        stopped: whether the search met its stopping criterion.
     """
 
     white: jax.Array

@@ -4,7 +4,7 @@ The dynamics must be linear in the state with constant coefficients, dx/dt = A x
 
 1. The forces u are Gaussian: their values on the grid are u = m + L v with independent standard normal numbers v.
 2. The production p is evaluated at the grid points.
-3. The state at the observation times is an integral of p, which a quadrature rule turns into a weighted sum over the
+3. The state at the observation times is an integral of p, which a quadrature turns into a weighted sum over the
    grid points since the previous observation (`lfm_ppl.latent_grid.quadrature_weights`).
 4. The states are accumulated over the observations by the transitions e^(A (t_k - t_(k-1))).
 5. log p(y | u) follows from states and forces at the observation times.
@@ -41,7 +41,7 @@ from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import semidefinite_root
 
-RULES = ("riemann", "trapezoid", "linear")
+QUADRATURES = ("riemann", "trapezoid", "linear")
 
 JITTER = 1e-10
 """Multiple of a force's largest variance that is added to the diagonal of its covariance, for a Cholesky factor."""
@@ -74,7 +74,7 @@ class LatentGrid(eqx.Module):
         times: (T,), observation times, non-decreasing.
         points: number of equally spaced points from the initial time to the last observation, or the grid (G,),
             increasing from the initial time.
-        rule: quadrature rule "riemann", "trapezoid" or "linear".
+        quadrature: "riemann", "trapezoid" or "linear".
 
     Each observation depends on the points since the previous observation. For coupled states the weights need a matrix
     exponential for each distinct distance; their number is small if the observations lie on the grid or at regular
@@ -92,7 +92,7 @@ class LatentGrid(eqx.Module):
             observations; else None.
         mean: (R, G), prior mean of the forces.
         root: (R, G, G), lower triangular factor of their prior covariance.
-        rule: quadrature rule.
+        quadrature: name of the quadrature.
         first: T indices, of the first grid point that each observation needs.
 
     Raises:
@@ -123,22 +123,22 @@ class LatentGrid(eqx.Module):
     transitions: jax.Array | None
     mean: jax.Array
     root: jax.Array
-    rule: str = eqx.field(static=True)
+    quadrature: str = eqx.field(static=True)
     first: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, model: LatentForceModel, times: ArrayLike, points: ArrayLike = 363, rule: str = "linear"):
+    def __init__(self, model: LatentForceModel, times: ArrayLike, points: ArrayLike = 363, quadrature: str = "linear"):
         if not isinstance(model, LatentForceModel):
             raise TypeError(f"model must be an lfm.LatentForceModel, got {type(model).__name__}.")
         warn_single_precision()
         ssm = state_space(model)
-        checks.one_of("rule", rule, RULES)
+        checks.one_of("quadrature", quadrature, QUADRATURES)
         _check_model(ssm)
         concrete_times = check_times(times, model.initial_time)
         if concrete_times is None:
             raise ValueError("times must be known when the grid is built, but they are traced.")
         initial_time = float(concrete_times[0] if model.initial_time is None else model.initial_time)
         check_noise(ssm, initial_time)
-        self.ssm, self.times, self.rule = ssm, concrete_times, rule
+        self.ssm, self.times, self.quadrature = ssm, concrete_times, quadrature
         self.grid = _build_grid(points, initial_time, self.times)
         # Interpolation is linear in the values: its matrix consists of the interpolated unit vectors.
         self.interpolation = np.stack([np.interp(self.times, self.grid, unit) for unit in np.eye(len(self.grid))],
@@ -159,7 +159,7 @@ class LatentGrid(eqx.Module):
                 return scalar_integrals(rates * lengths[..., None])
             return map_distinct(lambda h: matrix_integrals(jacobian, h)[1:], lengths)
 
-        self.weights = quadrature_weights(cells, transition, integrals, 1 if is_diagonal else 2, rule)
+        self.weights = quadrature_weights(cells, transition, integrals, 1 if is_diagonal else 2, quadrature)
         self.transition, self.transitions = transition(np.diff(self.times, prepend=self.grid[0])), None
         if is_diagonal and len(self.times) <= FEW:
             elapsed = np.maximum(self.times[:, None] - self.times, 0.0)

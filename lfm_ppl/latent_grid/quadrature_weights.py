@@ -66,7 +66,8 @@ def cut_cells(grid: np.ndarray, times: np.ndarray) -> CutCells:
     return CutCells(first, b - a, (a - start) / width, (b - start) / width, since_point, t - a, t - b)
 
 
-def quadrature_weights(cells: CutCells, transition: Callable, integrals: Callable, rank: int, rule: str) -> jax.Array:
+def quadrature_weights(cells: CutCells, transition: Callable, integrals: Callable, rank: int,
+                       quadrature: str) -> jax.Array:
     """Return the weights of the grid points, (M, T, C + 1) for a diagonal A, else (M, M, T, C + 1).
 
     Args:
@@ -74,17 +75,17 @@ def quadrature_weights(cells: CutCells, transition: Callable, integrals: Callabl
         transition: maps an array of lengths h to e^(A h).
         integrals: maps an array of lengths h to 1/h int_0^h e^(A (h - s)) ds and 1/h int_0^h e^(A (h - s)) s/h ds.
         rank: of a transition: 1 for the diagonal of a matrix, 2 for a matrix.
-        rule: quadrature rule, one of `lfm_ppl.latent_grid.latent_grid.RULES`.
+        quadrature: one of `lfm_ppl.latent_grid.latent_grid.QUADRATURES`.
     """
     def broadcast(a: np.ndarray) -> jax.Array:
         return jnp.asarray(a).reshape(*a.shape, *[1] * rank)
 
     multiply = jnp.multiply if rank == 1 else jnp.matmul
     length = broadcast(cells.length)
-    if rule == "riemann":
+    if quadrature == "riemann":
         point_weight, next_weight = length * transition(cells.since_point), jnp.zeros(())
     else:
-        if rule == "trapezoid":
+        if quadrature == "trapezoid":
             left_weight = 0.5 * length * transition(cells.since_left)
             right_weight = 0.5 * length * transition(cells.since_right)
         else:

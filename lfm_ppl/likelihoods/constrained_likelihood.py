@@ -1,10 +1,10 @@
 """The likelihood of a latent force model under constraints on states, forces and outputs.
 
 1. Constraints become boxes 0 <= c <= width at the rows of a grid (`lfm_ppl.constrained.boxes`).
-2. Expectation propagation with truncated normal sites gives log Z(y, c) and log Z(c); their difference is the log
+2. Expectation propagation with truncated normal factors gives log Z(y, c) and log Z(c); their difference is the log
    density of the data given that the constraints hold (`lfm_ppl.constrained.evidence`).
-3. Weighted trajectories that respect all constraints correct both for the error of the sites. Their random numbers are
-   the same for all parameters, so that the density has no noise.
+3. Weighted trajectories that respect all constraints correct both for the error of the factors. Their random numbers
+   are the same for all parameters, so that the density has no noise.
 4. Samples and posterior trajectories are chosen by their weights among such trajectories.
 
 Source: Cunningham, Hennig and Lacoste-Julien (2011), Gaussian probabilities and expectation propagation.
@@ -26,13 +26,13 @@ from lfm_ppl.constrained.evidence import TruncatedPosterior, check_linear, check
 from lfm_ppl.constrained.full_information import check_settings
 from lfm_ppl.filtering.backward import backward
 from lfm_ppl.filtering.ep.evidence import entry_leave_one_out
-from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD
 from lfm_ppl.filtering.moments import Record
 from lfm_ppl.filtering.problem import at_intervals
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.time_grid import build_time_grid
-from lfm_ppl.filtering.update import Sites
+from lfm_ppl.filtering.update import Factors
 from lfm_ppl.likelihoods.filter_settings import FilterSettings
 from lfm_ppl.likelihoods.marginal_likelihood import CONSTRAINTS, MarginalLikelihood
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood, check_model, repeat_draw
@@ -123,8 +123,8 @@ class ConstrainedLikelihood(SeriesLikelihood):
         return False
 
     @property
-    def has_sites(self) -> bool:
-        """Whether Gaussian sites approximate factors of the density."""
+    def has_factors(self) -> bool:
+        """Whether Gaussian factors approximate terms of the density."""
         return True
 
     @property
@@ -155,7 +155,7 @@ class ConstrainedLikelihood(SeriesLikelihood):
         ssm = stacked_model(self.model, boxes)
         grid = build_time_grid(ssm, rows.times, self.settings.steps)
         return TruncatedPosterior(ssm, self.settings.rule, grid, rows, boxes,
-                                  check_variances(self.model, np.shape(self.times)[0]), SiteSettings())
+                                  check_variances(self.model, np.shape(self.times)[0]), FactorSettings())
 
     def log_prob(self, value: Any) -> jax.Array:
         """Return log p(value | c), NaN where missing; batch dimensions may lead."""
@@ -167,7 +167,7 @@ class ConstrainedLikelihood(SeriesLikelihood):
                                         self.checked(value))
 
     def convergence(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return whether the sites converge, and whether the log density is finite."""
+        """Return whether the factors converge, and whether the log density is finite."""
         posterior = self.truncated_posterior()
         return posterior.converged(y), jnp.isfinite(posterior.log_likelihood(y, self.draws))
 
@@ -206,8 +206,8 @@ class ConstrainedLikelihood(SeriesLikelihood):
         at_data = at_data._replace(mean=at_data.mean[:, :outputs],
                                    covariance=at_data.covariance[:, :outputs, :outputs])
         fixed_point = propagated.refined.fixed_point
-        sites = Sites(*(a[data, :outputs] for a in fixed_point.sites))
-        value = entry_leave_one_out(at_data, sites, propagated.entries[data, :outputs])
+        factors = Factors(*(a[data, :outputs] for a in fixed_point.factors))
+        value = entry_leave_one_out(at_data, factors, propagated.entries[data, :outputs])
         return jnp.where(jnp.isnan(y), 0.0, jnp.where(fixed_point.converged, value, -jnp.inf))
 
 
@@ -230,8 +230,8 @@ def likelihood_with(model: LatentForceModel, times: Any, settings: Mapping[str, 
     if settings.get("iterations"):
         raise ValueError("under constraints a non-linear model is always linearised about smoothed moments. Leave "
                          "iterations out.")
-    if settings.get("sites") is not None:
-        raise ValueError("sites are for an observation family without constraints. Leave out sites.")
+    if settings.get("factors") is not None:
+        raise ValueError("factors are for an observation family without constraints. Leave out factors.")
     return ConstrainedLikelihood(model, times, rule, steps, **constraints)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from lfm_ppl.filtering.arguments import as_rule, check_iterations
-from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
+from lfm_ppl.filtering.ep.settings import FactorSettings, as_settings
 from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import Cubature
@@ -26,7 +26,7 @@ class FilterSettings:
         damping: largest share of each new iterate that is taken.
         tolerance: largest error of an integration step, in standard deviations; None: equal steps.
         method: of integration.
-        sites: of an observation family; None: expectation propagation.
+        factors: of an observation family; None: expectation propagation.
     """
 
     rule: Rule = Cubature()
@@ -36,7 +36,7 @@ class FilterSettings:
     damping: float = 0.7
     tolerance: float | None = None
     method: str = DEFAULT_METHOD
-    sites: SiteSettings | None = None
+    factors: FactorSettings | None = None
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -58,6 +58,6 @@ class FilterSettings:
             checks.positive("tolerance", given["tolerance"], "It is in standard deviations, 0.001 for example.")
             given["tolerance"] = float(given["tolerance"])
         checks.one_of("method", given.get("method", cls.method), METHODS)
-        if "sites" in given:
-            given["sites"] = as_settings(given["sites"])
+        if "factors" in given:
+            given["factors"] = as_settings(given["factors"])
         return cls(**given), frozenset(given)

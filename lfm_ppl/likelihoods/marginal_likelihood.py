@@ -2,8 +2,8 @@
 
 1. A Gaussian observation: the filter's innovations give log p(y_k | y_1:k-1). For a model that is not linear, posterior
    linearisation repeats the filter about the smoothed moments.
-2. An observation family: expectation propagation replaces each likelihood term by a Gaussian site; the log density is
-   the log evidence of the converged sites (`lfm_ppl.filtering.ep`).
+2. An observation family: expectation propagation replaces each likelihood term by a Gaussian factor; the log density is
+   the log evidence of the converged factors (`lfm_ppl.filtering.ep`).
 3. A failure inside compiled code is a log density of -inf with zero gradients; outside of it a warning names the row.
 
 Source: Hartikainen et al. (2012), section 4; Singer (2011), AStA 95.
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.evidence import Evidence, evidence
-from lfm_ppl.filtering.ep.settings import SiteSettings, as_settings
+from lfm_ppl.filtering.ep.settings import FactorSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.iterated import number_of_iterations
 from lfm_ppl.likelihoods.filter_settings import FilterSettings
@@ -69,11 +69,11 @@ class MarginalLikelihood(SeriesLikelihood):
             the moments, for every parameter anew, for posteriors over slow and fast models; up to five times ``steps``
             are tried. None: ``steps`` equal steps. Not with ``iterations``. A linear model has exact transitions, with
             equal steps over its known inputs.
-        sites: of an observation family, how its sites are refined: "ep" (expectation propagation, the default),
-            "variational", "laplace", or `lfm_ppl.SiteSettings`. The log density is then the log evidence of the
-            converged sites. Where the model is not linear it is linearised about smoothed moments, ``iterations`` times
-            (8 by default). Where sites do not converge, the log density of a model that is not linear is that of
-            assumed density filtering, which is rougher, and -inf in a linear one.
+        factors: of an observation family, how its factors are refined: "ep" (expectation propagation, the default),
+            "variational", "laplace", or `lfm_ppl.FactorSettings`. The log density is then the log evidence of the
+            converged factors. Where the model is not linear it is linearised about smoothed moments, ``iterations``
+            times (8 by default). Where factors do not converge, the log density of a model that is not linear is that
+            of assumed density filtering, which is rougher, and -inf in a linear one.
         method: of integration, "runge-kutta" (explicit, the default), or "exponential" for stiff dynamics: its steps of
             order three are stable however fast a state decays, and each costs some ten of the other. With a
             ``tolerance``, too.
@@ -83,7 +83,7 @@ class MarginalLikelihood(SeriesLikelihood):
             failure is a log density of -inf.
 
     Warns:
-        FilterWarning: outside of compiled code, where a log density is -inf or sites do not converge: where and how;
+        FilterWarning: outside of compiled code, where a log density is -inf or factors do not converge: where and how;
             where the last iteration changes a smoothed mean by more than one standard deviation, or the log density by
             more than 0.5; where an explicit step is too long for a fast decay: which state and row, and the remedy.
 
@@ -100,18 +100,18 @@ class MarginalLikelihood(SeriesLikelihood):
 
     def __init__(self, model: LatentForceModel, times: ArrayLike, rule: Rule | None = None, steps: int | None = None,
                  max_step: float | None = None, iterations: int | None = None, damping: float | None = None,
-                 tolerance: float | None = None, sites: SiteSettings | str | None = None, *,
+                 tolerance: float | None = None, factors: FactorSettings | str | None = None, *,
                  method: str | None = None, validate_args: bool | None = None, **unknown: Any):
         for name in unknown:
             remedy = "; constraints are arguments of lfm.ConstrainedLikelihood" if name in CONSTRAINTS else ""
             raise TypeError(f"MarginalLikelihood has no argument {name!r}{remedy}.")
         check_model(model)
         arguments = {"rule": rule, "steps": steps, "max_step": max_step, "iterations": iterations, "damping": damping,
-                     "tolerance": tolerance, "method": method, "sites": sites}
+                     "tolerance": tolerance, "method": method, "factors": factors}
         settings, given = FilterSettings.of(arguments)
-        if sites is not None and not isinstance(model.observation, ObservationFamily):
-            raise ValueError("sites are for an observation family such as lfm.PoissonObservation; the observation of "
-                             "this model is Gaussian, whose filter needs none. Leave out sites.")
+        if factors is not None and not isinstance(model.observation, ObservationFamily):
+            raise ValueError("factors are for an observation family such as lfm.PoissonObservation; the observation of "
+                             "this model is Gaussian, whose filter needs none. Leave out factors.")
         super().__init__(model, times, settings, given)
         self.settings = replace(settings, iterations=number_of_iterations(iterations, self.ssm, settings.tolerance))
 
@@ -123,7 +123,7 @@ class MarginalLikelihood(SeriesLikelihood):
     def description(self) -> str:
         """How the likelihood is computed: exact or by which approximation."""
         if self.is_family:
-            return f"approximate (sites by {self.sites_in_words})"
+            return f"approximate (factors by {self.factors_in_words})"
         settings = self.settings
         if self.ssm.plan.is_linear:
             if self.ssm.plan.has_exact_moments:
@@ -142,16 +142,16 @@ class MarginalLikelihood(SeriesLikelihood):
         return f"approximate ({count} of posterior linearisation)"
 
     @property
-    def site_settings(self) -> SiteSettings:
-        """Settings of the sites of an observation family."""
-        return as_settings(self.settings.sites, self.settings.iterations)
+    def factor_settings(self) -> FactorSettings:
+        """Settings of the factors of an observation family."""
+        return as_settings(self.settings.factors, self.settings.iterations)
 
     @property
-    def sites_in_words(self) -> str:
+    def factors_in_words(self) -> str:
         """Approximation of an observation family; empty for a Gaussian observation."""
         if not self.is_family:
             return ""
-        settings = self.site_settings
+        settings = self.factor_settings
         count = f", linearised at most {settings.relinearisations} times"
         return settings.method + ("" if self.ssm.plan.is_linear else count)
 
@@ -168,7 +168,7 @@ class MarginalLikelihood(SeriesLikelihood):
         else:
             # The guard is around the sum: one failure makes it -inf, and the derivatives of all other terms zero.
             log_likelihood = self._guarded_terms(y, lambda terms: terms.sum(keepdims=True))[0]
-        warn_of_breakdown(self.ssm, self.settings.rule, self.time_grid, y, None, log_likelihood, self.site_settings,
+        warn_of_breakdown(self.ssm, self.settings.rule, self.time_grid, y, None, log_likelihood, self.factor_settings,
                           has_converged)
         self.warn_of_long_steps(y, log_likelihood)
         return log_likelihood
@@ -177,10 +177,10 @@ class MarginalLikelihood(SeriesLikelihood):
         """Return the log evidence of an observation family and its parts; ``y`` (T, D) is not checked."""
         assert isinstance(self.model.observation, ObservationFamily)
         terms = FamilyTerms(self.model.observation, y)
-        return evidence(self.problem, terms, self.site_settings)
+        return evidence(self.problem, terms, self.factor_settings)
 
     def convergence(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return whether the sites converge, and whether the log evidence is finite."""
+        """Return whether the factors converge, and whether the log evidence is finite."""
         result = self.evidence(y)
         return result.refined.fixed_point.converged, jnp.isfinite(result.log_evidence)
 

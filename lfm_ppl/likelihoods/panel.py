@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
-from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.filtering.stiffness import long_step_message, warn_of_message
 from lfm_ppl.likelihoods.constrained_likelihood import likelihood_with
 from lfm_ppl.likelihoods.likelihood import Likelihood
@@ -204,7 +204,7 @@ class Panel(Likelihood):
 
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayLike, rule: Rule | None = None,
           steps: int | None = None, max_step: float | None = None, iterations: int | None = None,
-          damping: float | None = None, tolerance: float | None = None, sites: SiteSettings | str | None = None,
+          damping: float | None = None, tolerance: float | None = None, factors: FactorSettings | str | None = None,
           method: str | None = None) -> Panel:
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.
 
@@ -221,7 +221,7 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         iterations: of posterior linearisation; by default 3 for models that are not linear, see `MarginalLikelihood`.
         damping: largest share of each new iterate that is taken; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations; None for equal steps.
-        sites: of an observation family.
+        factors: of an observation family.
         method: of integration.
 
     Returns:
@@ -241,5 +241,5 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         (2,)
     """
     arguments = {"rule": rule, "steps": steps, "max_step": max_step, "iterations": iterations, "damping": damping,
-                 "tolerance": tolerance, "sites": sites, "method": method}
+                 "tolerance": tolerance, "factors": factors, "method": method}
     return Panel(build, parameters, times, arguments)

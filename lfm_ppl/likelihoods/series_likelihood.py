@@ -23,7 +23,7 @@ from numpyro.primitives import _PYRO_STACK
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.breakdown import warn_of_breakdown, warn_of_iterations
 from lfm_ppl.filtering.ep.moment_matching import assumed_density_filter
-from lfm_ppl.filtering.ep.settings import SiteSettings
+from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.filtering.filter import FilterResult, filter_on
 from lfm_ppl.filtering.forward import forward
 from lfm_ppl.filtering.grid_layout import GridLayout
@@ -164,8 +164,8 @@ class SeriesLikelihood(Likelihood):
         return True
 
     @property
-    def has_sites(self) -> bool:
-        """Whether Gaussian sites approximate factors of the density."""
+    def has_factors(self) -> bool:
+        """Whether Gaussian factors approximate terms of the density."""
         return self.is_family
 
     @property
@@ -188,12 +188,12 @@ class SeriesLikelihood(Likelihood):
         return {name: value for name, value in recorded.items() if name in self.accepted}
 
     @property
-    def site_settings(self) -> SiteSettings:
-        """Settings of the sites of an observation family."""
-        return SiteSettings()
+    def factor_settings(self) -> FactorSettings:
+        """Settings of the factors of an observation family."""
+        return FactorSettings()
 
     @property
-    def sites_in_words(self) -> str:
+    def factors_in_words(self) -> str:
         """Approximation of an observation family; empty for a Gaussian observation."""
         return ""
 
@@ -283,7 +283,7 @@ class SeriesLikelihood(Likelihood):
         """
         grid, y = self.smoother_grid(at, steps), self.checked(y)
         result = smooth_on(self.ssm, self.settings.rule, grid, y, self.settings.iterations, self.settings.damping,
-                           self.site_settings)
+                           self.factor_settings)
         if not self.is_family:
             warn_of_iterations(result.change, result.log_likelihood_change)
         warn_of_long_steps(self.ssm, self.settings.rule, grid, self.settings.steps if steps is None else steps,
@@ -335,7 +335,7 @@ class SeriesLikelihood(Likelihood):
         return smoothed.entry_leave_one_out
 
     def convergence(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return whether the sites converge, and whether the log density is finite."""
+        """Return whether the factors converge, and whether the log density is finite."""
         raise NotImplementedError
 
     def checked(self, y: Any) -> jax.Array:

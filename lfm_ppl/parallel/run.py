@@ -12,8 +12,8 @@ from typing import Any
 from lfm_ppl.parallel.cluster import Workers, check_workers, compute_on_workers, start_workers
 from lfm_ppl.parallel.errors import TasksFailedError
 from lfm_ppl.parallel.task import Compute, Computed, Result, Task, compute_task
+from lfm_ppl.storage.run_store import DamagedFileError, RunStore
 from lfm_ppl.utils.progress import Reporter, TaskProgress
-from lfm_ppl.utils.run_store import DamagedFileError, RunStore
 
 
 @dataclass(frozen=True)

@@ -20,16 +20,17 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl.results import convergence, files, netcdf
+from lfm_ppl.results import convergence, netcdf
 from lfm_ppl.results.scalars import scalar_draws, scalar_truth
+from lfm_ppl.storage import files
 
 LIBRARY = "lfm_ppl"
 
-SITES = "site_failures"
-"""Attribute of a result: counts of `lfm_ppl.inference.site_failures`, as JSON."""
+FACTORS = "factor_failures"
+"""Attribute of a result: counts of `lfm_ppl.inference.factor_failures`, as JSON."""
 
 WEIGHTS = "constraint_weights"
-"""Attribute of a result under constraints: `site_failures.PathESS`, effective sample sizes, as JSON."""
+"""Attribute of a result under constraints: `factor_failures.PathESS`, effective sample sizes, as JSON."""
 
 MODE = "mode"
 """Attribute of a result of sampler "map": name -> value at the posterior mode, as JSON."""
@@ -287,7 +288,7 @@ def of_mode(result: Any) -> bool:
 def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list[str]:
     """Return what is wrong with the draws of ``result``, one message per finding.
 
-    R-hat above 1.01, bulk or tail effective sample size below 100 per chain, divergences, sites of
+    R-hat above 1.01, bulk or tail effective sample size below 100 per chain, divergences, factors of
     an observation family or of constraints that do not converge, trajectories under constraints that are worth little.
     Draws from a Laplace approximation (sampler "map") are independent, and give none but the last two, and that the
     mode is degenerate.
@@ -301,20 +302,20 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     """
     attrs = attributes(result)
     from_mode = attrs.get("sampler") == "map"
-    of_sites = convergence.of_sites(*json.loads(attrs.get(SITES, "[0, 0, 0]")), constrained="constraints" in attrs,
-                                    from_mode=from_mode)
-    of_sites += convergence.of_weights(*json.loads(attrs.get(WEIGHTS, "[0, 0, 0]")))
+    of_factors = convergence.of_factors(*json.loads(attrs.get(FACTORS, "[0, 0, 0]")),
+                                        constrained="constraints" in attrs, from_mode=from_mode)
+    of_factors += convergence.of_weights(*json.loads(attrs.get(WEIGHTS, "[0, 0, 0]")))
     if of_mode(result):
         rows = summary(result) if table is None else table
         degenerate = [label for label in _degenerate(result) if label in rows.index]
-        return convergence.of_degenerate_mode(rows.loc[degenerate]) + of_sites
+        return convergence.of_degenerate_mode(rows.loc[degenerate]) + of_factors
     if from_mode or "effective_draws" in attrs:
-        return of_sites if from_mode else []
+        return of_factors if from_mode else []
     sizes = group(result, "posterior").sizes
     stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
     divergences = int(stats["diverging"].sum()) if "diverging" in stats else 0
     rows = summary(result) if table is None else table
-    return convergence.messages(rows, sizes["chain"], sizes["draw"], divergences) + of_sites
+    return convergence.messages(rows, sizes["chain"], sizes["draw"], divergences) + of_factors
 
 
 def mcse_mean(values: np.ndarray) -> float:

@@ -1,7 +1,7 @@
 """Warnings on the convergence of chains, and their remedies.
 
 1. R-hat and effective sample sizes of all scalars are compared with thresholds.
-2. Divergences, unconverged sites and few weighted trajectories give further messages.
+2. Divergences, unconverged factors and few weighted trajectories give further messages.
 3. Each message names the number, its threshold and the remedy.
 
 Source: Vehtari et al. (2021), Bayesian Analysis 16(2), for the thresholds.
@@ -21,8 +21,8 @@ LEAST_TRAJECTORIES = 10
 
 _NAMED = 5
 
-_OF_FAMILY = ("Take a smaller share of each new site, sites=lfm.SiteSettings(damping=0.5), half powers, "
-              "sites=lfm.SiteSettings(power=0.5), or a tighter prior.")
+_OF_FAMILY = ("Take a smaller share of each new factor, factors=lfm.FactorSettings(damping=0.5), half powers, "
+              "factors=lfm.FactorSettings(power=0.5), or a tighter prior.")
 _OF_CONSTRAINTS = ("Let the constraints hold at fewer times (grid, --grid), or see with lfm.full_information whether "
                    "they can be respected at all.")
 
@@ -76,22 +76,22 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     return warnings_found
 
 
-def of_sites(points: int, unconverged: int, impossible: int, *, constrained: bool = False,
-             from_mode: bool = False) -> list[str]:
-    """Return what to say where sites do not converge near the draws; nothing where they do.
+def of_factors(points: int, unconverged: int, impossible: int, *, constrained: bool = False,
+               from_mode: bool = False) -> list[str]:
+    """Return what to say where factors do not converge near the draws; nothing where they do.
 
     Args:
         points: a step away from the draws, at which it was tried.
-        unconverged: of them, where sites do not converge.
+        unconverged: of them, where factors do not converge.
         impossible: of them, where the likelihood is zero, for that reason or another.
-        constrained: they are sites of constraints, and not of an observation family.
+        constrained: they are factors of constraints, and not of an observation family.
         from_mode: the points are draws of a Laplace approximation.
     """
     if not unconverged:
         return []
     which, remedy = (("constraints", _OF_CONSTRAINTS) if constrained else ("observation family", _OF_FAMILY))
     where = "draws of the Laplace approximation" if from_mode else "points a step away from the draws"
-    message = (f"the sites of the {which} do not converge at {unconverged} of {points} {where} "
+    message = (f"the factors of the {which} do not converge at {unconverged} of {points} {where} "
             f"({100.0 * unconverged / points:.3g}%), ")
     if not impossible:
         return [f"{message}where the likelihood is that of assumed density filtering, which is rougher. {remedy}"]

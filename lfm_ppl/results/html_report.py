@@ -27,12 +27,12 @@ from markupsafe import Markup
 
 from lfm_ppl.accuracy import report
 from lfm_ppl.results import arviz_data, predictions, tables
-from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import ORIGIN, input_unit, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import saving
 from lfm_ppl.results.residuals import misfit
 from lfm_ppl.results.scalars import unit_of
 from lfm_ppl.results.series import TIMES, select_series, series_dimension, series_labels, times_of
+from lfm_ppl.storage.files import POSTERIOR
 from lfm_ppl.utils import calendar_time
 from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
 
@@ -53,7 +53,7 @@ _DIAGNOSTICS = ["mcse_mean", "ess_bulk", "ess_tail", "r_hat"]
 
 _NOT_SETTINGS = ("model", "model_file", "description", "data", "note", "warnings", "partial", "settings", "run",
                  "map_converged", arviz_data.MODE, "command_line", "call", ORIGIN, "priors", "meanings", "assumptions",
-                 "inference_library", arviz_data.SITES, arviz_data.WEIGHTS, arviz_data.DEGENERATE)
+                 "inference_library", arviz_data.FACTORS, arviz_data.WEIGHTS, arviz_data.DEGENERATE)
 """Attributes that stand in other sections, or that only programs read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"

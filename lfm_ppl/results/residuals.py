@@ -126,7 +126,7 @@ def misfit(result: Any) -> list[str]:
     is_approximate = "constraints" in attrs or str(attrs.get("sampler", "")).startswith("pmmh")
     if is_approximate or not has_group(result, "one_step_ahead") or series_dimension(result) is not None:
         return []
-    remedy = "" if "sites" in attrs else " (lfm.StudentTObservation)"
+    remedy = "" if "factors" in attrs else " (lfm.StudentTObservation)"
     messages, residual, tests = [], mean_residuals(result), residual_tests(result)
     for index in range(residual.sizes["output"]):
         name, test = tests.index[index], tests.iloc[index]

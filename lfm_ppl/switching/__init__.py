@@ -1,1 +1,1 @@
-"""Linear models with a discrete input under a known rule."""
+"""Linear models with a discrete input under a known controller, and regimes of a Markov chain."""

@@ -1,4 +1,4 @@
-"""A Markov chain of regimes in continuous time, as a rule of a discrete input."""
+"""A Markov chain of regimes in continuous time, as the controller of a discrete input."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jax.scipy.special import ndtr
 
 from lfm_ppl.forces.discretise import MOST_DOUBLINGS, repeat, substep_series
-from lfm_ppl.switching.rule import SwitchingRule
+from lfm_ppl.switching.controller import Controller
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import matmul
 
@@ -76,8 +76,8 @@ def transition_matrices(rates: jax.Array, lengths: jax.Array) -> jax.Array:
     return jax.vmap(transition)(lengths)
 
 
-class MarkovChain(SwitchingRule):
-    """The rule of a Markov chain: its reading is a random number that does not depend on the state.
+class MarkovChain(Controller):
+    """A Markov chain as a controller: its reading is a random number that does not depend on the state.
 
     Attributes:
         times: (T,), times of the decisions, increasing.

@@ -1,12 +1,12 @@
-"""Rao-Blackwellised particle filter for a linear model with a discrete input that follows a known rule.
+"""Rao-Blackwellised particle filter for a linear model with a discrete input under a known controller.
 
-Given the path of the discrete input and the readings of its rule, the state of a linear model is Gaussian. A particle
-carries the input d and the mean m and covariance P of the joint state. For each row of the time grid:
+Given the path of the discrete input and the readings of its controller, the state of a linear model is Gaussian. A
+particle carries the input d and the mean m and covariance P of the joint state. For each row of the time grid:
 
 1. Predict m and P over the row with the model of the particle's input.
 2. If there is an observation, update m and P, and multiply the particle's weight by the exact density of the
    observation given the particle.
-3. If the row ends with a decision, draw the reading r_k, condition m and P on it, and apply the rule:
+3. If the row ends with a decision, draw the reading r_k, condition m and P on it, and decide:
 
        r_k ~ N(G m + g, G P G' + V),    (m, P) <- (m, P) given r_k,    d_k = decide(d_k-1, r_k, t_k).
 
@@ -38,8 +38,8 @@ from lfm_ppl.filtering.update import LinearizedObservation, Update, condition
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.normals import normals
 from lfm_ppl.particles.resampling import RESAMPLING, effective_sample_size, resample, reweight
+from lfm_ppl.switching.controller import Controller
 from lfm_ppl.switching.mixture import Mixture
-from lfm_ppl.switching.rule import SwitchingRule
 from lfm_ppl.switching.switched_model import (
     Build,
     SwitchedMap,
@@ -101,25 +101,25 @@ class _Particles(NamedTuple):
     log_weights: jax.Array
 
 
-def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: ArrayLike, *,
+def rao_blackwellised(key: jax.Array, build: Build, controller: Controller, times: ArrayLike, *,
                       y: ArrayLike | None = None, start: FilterState | None = None, initial: Any = 0,
                       decisions: Any = None, particles: int = 1000, steps: int = 10, max_step: float | None = None,
                       resampling: str = "systematic", threshold: float = 0.5) -> RaoBlackwellisedResult:
-    """Predict, or filter, a linear latent force model with a discrete input that follows a known rule.
+    """Predict, or filter, a linear latent force model with a discrete input under a known controller.
 
-    A particle draws only the readings of the rule; see the module `lfm_ppl.switching.rao_blackwellised`. Within
+    A particle draws only the readings of the controller; see the module `lfm_ppl.switching.rao_blackwellised`. Within
     ``jax.jit`` the times must be known, and one compilation serves all values of the other arguments. Outside of it
     each call compiles, because ``build`` returns new functions: put repeated calls under ``jax.jit``.
 
     Args:
         key: a JAX random key.
         build: function from a value of the input to the `LatentForceModel` that holds while the input has this value.
-        rule: rule of the input, such as `lfm.Thermostat`.
+        controller: controller of the input, such as `lfm.Thermostat`.
         times: (T,), non-decreasing, times of observations or predictions.
         y: (T, D), NaN where missing; None: no observations, a prediction.
         start: the ``state`` of a filter's result, from which to continue; None: the model's initial state.
-        initial: index in ``rule.values`` of the input at the start, or (N,), one for each particle.
-        decisions: times at which the rule is applied, after an observation at the same time; None: ``times``.
+        initial: index in ``controller.values`` of the input at the start, or (N,), one for each particle.
+        decisions: times of its decisions, after an observation at the same time; None: ``times``.
         particles: number of particles N.
         steps: integration steps between two consecutive times; a time-invariant model is exact with any number.
         max_step: longest step; a longer interval gets more steps.
@@ -131,7 +131,7 @@ def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: 
 
     Raises:
         ValueError: a model or a reading that is not linear, an invalid index ``initial``, and as `lfm_ppl.filter`.
-        TypeError: ``rule`` is not a rule, or ``key`` is not a random key.
+        TypeError: ``controller`` is not a controller, or ``key`` is not a random key.
 
     Example:
         >>> import jax, jax.numpy as jnp, lfm_ppl as lfm
@@ -153,15 +153,15 @@ def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     checks.one_of("resampling", resampling, RESAMPLING)
     if not 0.0 <= threshold <= 1.0:
         raise ValueError(f"threshold must lie in [0, 1], a share of the particles, got {threshold}.")
-    ssms = build_models(build, rule)
+    ssms = build_models(build, controller)
     for ssm in ssms:
-        check_linear(ssm, rule)
+        check_linear(ssm, controller)
     grid, is_decision = decision_grid(ssms[0], times, decisions, start, steps, max_step)
     warn_single_precision()
     shape = (len(grid.observed), ssms[0].output_dim)
     y = jnp.full(shape, jnp.nan) if y is None else check_observations(y, *shape, empty=True)
-    problem = SwitchedProblem(ssms, rule, grid, jnp.asarray(is_decision), initial_moments(ssms[0], start),
-                              initial_indices(initial, rule, particles))
+    problem = SwitchedProblem(ssms, controller, grid, jnp.asarray(is_decision), initial_moments(ssms[0], start),
+                              initial_indices(initial, controller, particles))
     return _filter(problem, jnp.asarray(times, float), y, key, resampling, threshold, is_input_additive(build))
 
 
@@ -169,9 +169,9 @@ def rao_blackwellised(key: jax.Array, build: Build, rule: SwitchingRule, times: 
 def _filter(problem: SwitchedProblem, times: jax.Array, y: jax.Array, key: jax.Array, resampling: str,
             threshold: float, shared: bool) -> RaoBlackwellisedResult:
     """Run the filter; ``shared``: all particles have the same covariance."""
-    ssm, rule, grid = problem.ssms[0], problem.rule, problem.grid
+    ssm, controller, grid = problem.ssms[0], problem.controller, problem.grid
     count = problem.initial_index.shape[0]
-    interval_maps = [make_interval_map(ssm, rule, grid) for ssm in problem.ssms]
+    interval_maps = [make_interval_map(ssm, controller, grid) for ssm in problem.ssms]
     equal = jnp.full(count, -np.log(count))
 
     def step(particles: _Particles,
@@ -185,11 +185,11 @@ def _filter(problem: SwitchedProblem, times: jax.Array, y: jax.Array, key: jax.A
         particles, log_likelihood = _update(ssm, particles, maps, y_row, shared)
         summary = _summarize(particles, maps, shared)
         particles = jax.lax.cond(
-            is_decision, lambda p: _decide(rule, p, maps, interval.end, reading_key, shared),
+            is_decision, lambda p: _decide(controller, p, maps, interval.end, reading_key, shared),
             lambda p: p, particles)
         weights = jnp.exp(particles.log_weights)
         ess = effective_sample_size(weights)
-        summary = (*summary, jnp.asarray(rule.values)[particles.input_index], ess, log_likelihood)
+        summary = (*summary, jnp.asarray(controller.values)[particles.input_index], ess, log_likelihood)
         is_resampled = jnp.isfinite(y_row).any() & (ess < threshold * count)
         ancestors = jax.lax.cond(is_resampled, lambda: resample(resampling_key, weights, resampling),
                                  lambda: jnp.arange(count))
@@ -251,11 +251,11 @@ def _update(ssm: StateSpaceModel, particles: _Particles, maps: SwitchedMap, y_ro
     return particles, jnp.where(is_observed, jnp.where(jnp.isnan(total), -jnp.inf, total), 0.0)
 
 
-def _decide(rule: SwitchingRule, particles: _Particles, maps: SwitchedMap, t: jax.Array, key: jax.Array,
+def _decide(controller: Controller, particles: _Particles, maps: SwitchedMap, t: jax.Array, key: jax.Array,
             shared: bool) -> _Particles:
-    """Draw the reading of each particle, condition the particle on it, and apply the rule."""
+    """Draw the reading of each particle, condition the particle on it, and decide."""
     predicted = _matvec(maps.reading_jacobian, particles.mean, shared) + maps.reading_offset
-    reading_cov = jnp.diag(rule.variance())
+    reading_cov = jnp.diag(controller.variance())
 
     def condition_on_reading(jacobian: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         cross_cov = matmul(covariance, jacobian.T)
@@ -269,7 +269,7 @@ def _decide(rule: SwitchingRule, particles: _Particles, maps: SwitchedMap, t: ja
     root, gain, covariance = (condition_on_reading if shared else jax.vmap(condition_on_reading))(
         maps.reading_jacobian, particles.covariance)
     innovation = _matvec(root, normals(key, predicted.shape[1], predicted.shape[0]).T, shared)
-    input_index = jax.vmap(lambda d, r: rule.decide(d, r, t))(particles.input_index, predicted + innovation)
+    input_index = jax.vmap(lambda d, r: controller.decide(d, r, t))(particles.input_index, predicted + innovation)
     return particles._replace(mean=particles.mean + _matvec(gain, innovation, shared), covariance=covariance,
                               input_index=input_index.astype(particles.input_index.dtype))
 

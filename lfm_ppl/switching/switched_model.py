@@ -31,7 +31,7 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation_noise import require_gaussian
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
 from lfm_ppl.model.structure import pattern
-from lfm_ppl.switching.rule import SwitchingRule
+from lfm_ppl.switching.controller import Controller
 from lfm_ppl.utils import checks
 
 Build = Callable[[Any], LatentForceModel]
@@ -39,11 +39,11 @@ Build = Callable[[Any], LatentForceModel]
 
 
 class SwitchedProblem(eqx.Module):
-    """Models, rule, time grid and initial values of a filter or a simulation.
+    """Models, controller, time grid and initial values of a filter or a simulation.
 
     Attributes:
         ssms: the model for each value of the input.
-        rule: the rule of the input.
+        controller: of the input.
         grid: the time grid.
         is_decision: (K,), whether a row ends with a decision.
         start: moments of the joint state at the initial time.
@@ -51,7 +51,7 @@ class SwitchedProblem(eqx.Module):
     """
 
     ssms: tuple[StateSpaceModel, ...]
-    rule: SwitchingRule
+    controller: Controller
     grid: TimeGrid
     is_decision: jax.Array
     start: Moments
@@ -65,7 +65,7 @@ class SwitchedMap(NamedTuple):
         phi, offset, process_cov: (n, n), (n,), (n, n), of the transition s -> phi s + offset + N(0, process_cov).
         jacobian, observation_offset, obs_cov: (D, n), (D,), (D, D), of the observation at the end of the row,
             y = jacobian s + observation_offset + N(0, obs_cov).
-        reading_jacobian, reading_offset: (p, n), (p,), of the rule's reading without its error.
+        reading_jacobian, reading_offset: (p, n), (p,), of the controller's reading without its error.
     """
 
     phi: jax.Array
@@ -78,26 +78,28 @@ class SwitchedMap(NamedTuple):
     reading_offset: jax.Array
 
 
-def build_models(build: Build, rule: SwitchingRule) -> tuple[StateSpaceModel, ...]:
+def build_models(build: Build, controller: Controller) -> tuple[StateSpaceModel, ...]:
     """Return the model for each value of the input.
 
     Raises:
-        TypeError: ``rule`` is not a rule.
+        TypeError: ``controller`` is not a controller.
         ValueError: the models differ in their states, outputs, jump times or initial state.
     """
-    if not isinstance(rule, SwitchingRule):
-        raise TypeError(f"rule must be an lfm.SwitchingRule such as lfm.Thermostat(20.0), got {type(rule).__name__}.")
-    models = [build(value) for value in rule.values]
+    if not isinstance(controller, Controller):
+        raise TypeError("controller must be an lfm.Controller such as lfm.Thermostat(20.0), got "
+                        f"{type(controller).__name__}.")
+    models = [build(value) for value in controller.values]
     ssms = tuple(state_space(model) for model in models)
-    check_structure({f"build({value:g})": ssm for value, ssm in zip(rule.values, ssms, strict=True)})
+    check_structure({f"build({value:g})": ssm for value, ssm in zip(controller.values, ssms, strict=True)})
     if any(ssm.model.events for ssm in ssms):
-        raise ValueError("the models have events, which a model that switches by a rule does not support; leave them "
+        raise ValueError("the models have events, which a model with a controller does not support; leave them "
                          "out.")
     starts = [[checks.concrete(entry) for entry in (*ssm.initial(), ssm.model.initial_time)] for ssm in ssms]
-    for value, start in zip(rule.values, starts, strict=True):
+    for value, start in zip(controller.values, starts, strict=True):
         pairs = zip(start, starts[0], strict=True)
         if any(a is not None and b is not None and not np.array_equal(a, b) for a, b in pairs):
-            raise ValueError(f"build({value:g}) has another initial state or time than build({rule.values[0]:g}); the "
+            first = controller.values[0]
+            raise ValueError(f"build({value:g}) has another initial state or time than build({first:g}); the "
                              "input acts from the initial time on, so both models must start alike.")
     return tuple(state_space(with_forces_of(model, models[0])) for model in models)
 
@@ -150,19 +152,20 @@ def initial_moments(ssm: StateSpaceModel, start: FilterState | None) -> Moments:
     return Moments(start.mean, start.covariance)
 
 
-def initial_indices(initial: Any, rule: SwitchingRule, particles: int) -> jax.Array:
+def initial_indices(initial: Any, controller: Controller, particles: int) -> jax.Array:
     """Check the index of the input at the start, one or one for each particle, and return it as (N,)."""
     if np.shape(initial) not in ((), (particles,)):
         raise ValueError(f"initial must be one index or one for each of the {particles} particles, got shape "
                          f"{np.shape(initial)}.")
     index = checks.concrete(initial)
-    last = len(rule.values) - 1
+    last = len(controller.values) - 1
     if index is not None and (index.dtype.kind not in "biu" or np.any((index < 0) | (index > last))):
-        raise ValueError(f"initial must be an index in rule.values = {rule.values}, 0 to {last}, got {initial!r}.")
+        raise ValueError(f"initial must be an index in controller.values = {controller.values}, 0 to {last}, got "
+                         f"{initial!r}.")
     return jnp.broadcast_to(jnp.asarray(initial, int), (particles,))
 
 
-def check_linear(ssm: StateSpaceModel, rule: SwitchingRule) -> None:
+def check_linear(ssm: StateSpaceModel, controller: Controller) -> None:
     """Raise ValueError unless model and reading are linear in states and forces."""
     require_gaussian(ssm, "the Rao-Blackwellised particle filter", "lfm.particle_filter")
     names = (*ssm.model.state_names, *ssm.model.force_names)
@@ -172,10 +175,11 @@ def check_linear(ssm: StateSpaceModel, rule: SwitchingRule) -> None:
                              "not Gaussian given the discrete input. Use lfm.simulate_switched, which draws whole "
                              "states.")
     size = len(names)
-    hessian = pattern(lambda v: rule.reading(*ssm.split(v[:size]), v[size]), size + 1).hessian[:size, :size]
+    hessian = pattern(lambda v: controller.reading(*ssm.split(v[:size]), v[size]), size + 1).hessian[:size, :size]
     if hessian.any():
-        raise ValueError(f"the reading of the rule is not linear in {names[int(np.argmax(hessian.any(axis=1)))]!r}. "
-                         "Use lfm.simulate_switched, which draws whole states.")
+        name = names[int(np.argmax(hessian.any(axis=1)))]
+        raise ValueError(f"the reading of the controller is not linear in {name!r}. Use lfm.simulate_switched, which "
+                         "draws whole states.")
 
 
 def is_input_additive(build: Build) -> bool:
@@ -197,7 +201,7 @@ def is_input_additive(build: Build) -> bool:
         return False  # build branches in Python on the value of the input, so that anything may depend on it
 
 
-def make_interval_map(ssm: StateSpaceModel, rule: SwitchingRule,
+def make_interval_map(ssm: StateSpaceModel, controller: Controller,
                       grid: TimeGrid) -> Callable[[Intervals], SwitchedMap]:
     """Return a traceable function from a row to the affine maps of a linear model."""
     size = ssm.state_dim
@@ -213,7 +217,7 @@ def make_interval_map(ssm: StateSpaceModel, rule: SwitchingRule,
             return ssm.observe(ssm.inputs(s, end), end)
 
         def read(s: jax.Array) -> jax.Array:
-            return rule.reading(*ssm.split(ssm.inputs(s, end)), end)
+            return controller.reading(*ssm.split(ssm.inputs(s, end)), end)
 
         obs_cov = ssm.obs_cov(ssm.inputs(zero, end), end, jnp.maximum(interval.observation, 0))
         return SwitchedMap(prediction.phi, prediction.moments.mean, prediction.process_cov,

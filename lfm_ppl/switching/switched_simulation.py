@@ -1,4 +1,4 @@
-"""Simulation of models with a discrete input that follows a known rule."""
+"""Simulation of models with a discrete input under a known controller."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lfm_ppl.filtering.intervals import Intervals, as_arrays
 from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.particles.normals import normals
 from lfm_ppl.particles.stochastic_steps import ParticleTransition, choose_scheme, initial_particles
-from lfm_ppl.switching.rule import SwitchingRule
+from lfm_ppl.switching.controller import Controller
 from lfm_ppl.switching.switched_model import (
     Build,
     SwitchedProblem,
@@ -46,10 +46,10 @@ class SwitchedSimulation(eqx.Module):
     y: jax.Array
 
 
-def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: ArrayLike, *, paths: int = 1,
+def simulate_switched(key: jax.Array, build: Build, controller: Controller, times: ArrayLike, *, paths: int = 1,
                       start: FilterState | None = None, initial: Any = 0, decisions: Any = None, steps: int = 10,
                       max_step: float | None = None, scheme: str = "auto") -> SwitchedSimulation:
-    """Draw paths of a latent force model with a discrete input that follows a known rule.
+    """Draw paths of a latent force model with a discrete input under a known controller.
 
     The model may be non-linear. For linear models, the averages of `lfm_ppl.rao_blackwellised` have less variance than
     averages over paths. Outside of ``jax.jit`` each call compiles, because ``build`` returns new functions: put
@@ -58,12 +58,12 @@ def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     Args:
         key: a JAX random key.
         build: function from a value of the input to the `LatentForceModel` that holds while the input has this value.
-        rule: rule of the input, such as `lfm.Thermostat`.
+        controller: controller of the input, such as `lfm.Thermostat`.
         times: (T,), non-decreasing.
         paths: number of paths N.
         start: the ``state`` of a filter's result, from which to continue; None: the model's initial state.
-        initial: index in ``rule.values`` of the input at the start, or (N,), one for each path.
-        decisions: times at which the rule is applied; None: ``times``.
+        initial: index in ``controller.values`` of the input at the start, or (N,), one for each path.
+        decisions: times of its decisions; None: ``times``.
         steps: integration steps between two consecutive times.
         max_step: longest step; a longer interval gets more steps.
         scheme: integration scheme, as in `lfm_ppl.particle_filter`.
@@ -86,11 +86,11 @@ def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: 
     """
     checks.random_key(key)
     checks.positive_integer("paths", paths)
-    ssms = build_models(build, rule)
+    ssms = build_models(build, controller)
     schemes = tuple(choose_scheme(ssm, scheme) for ssm in ssms)
     grid, is_decision = decision_grid(ssms[0], times, decisions, start, steps, max_step)
-    problem = SwitchedProblem(ssms, rule, grid, jnp.asarray(is_decision), initial_moments(ssms[0], start),
-                              initial_indices(initial, rule, paths))
+    problem = SwitchedProblem(ssms, controller, grid, jnp.asarray(is_decision), initial_moments(ssms[0], start),
+                              initial_indices(initial, controller, paths))
     return _simulate(problem, schemes, jnp.asarray(times, float), key)
 
 
@@ -98,7 +98,7 @@ def simulate_switched(key: jax.Array, build: Build, rule: SwitchingRule, times: 
 def _simulate(problem: SwitchedProblem, schemes: tuple[str, ...], times: jax.Array,
               key: jax.Array) -> SwitchedSimulation:
     """Simulate all paths; ``schemes`` are the integration schemes of the models."""
-    ssm, values = problem.ssms[0], jnp.asarray(problem.rule.values)
+    ssm, values = problem.ssms[0], jnp.asarray(problem.controller.values)
     w, y, _, next_indices = simulate_paths(problem, schemes, times, key)
     size = ssm.physical_dim
     forces = {name: w[:, :, size + number] for number, name in enumerate(ssm.model.force_names)}
@@ -110,16 +110,16 @@ def simulate_paths(problem: SwitchedProblem, schemes: tuple[str, ...], times: ja
     """Simulate all paths: inputs (T, N, M + R), observations (T, N, D), indices (T, N) before and after the decisions.
 
     Args:
-        problem: models, rule, time grid and initial values.
+        problem: models, controller, time grid and initial values.
         schemes: integration schemes of the models.
         times: (T,), times of the observations.
         key: a JAX random key.
     """
-    ssms, rule, grid = problem.ssms, problem.rule, problem.grid
+    ssms, controller, grid = problem.ssms, problem.controller, problem.grid
     paths = problem.initial_index.shape[0]
     initial_key, rows_key, noise_key = jax.random.split(key, 3)
     initial_state = initial_particles(initial_key, problem.start.mean, problem.start.covariance, paths)
-    reading_root = semidefinite_root(jnp.diag(rule.variance()))
+    reading_root = semidefinite_root(jnp.diag(controller.variance()))
     transitions = [ParticleTransition(ssm, scheme, grid) for ssm, scheme in zip(ssms, schemes, strict=True)]
 
     def step(carry: tuple[jax.Array, jax.Array], inputs: tuple[Intervals, jax.Array, jax.Array]) -> tuple[tuple, tuple]:
@@ -133,11 +133,11 @@ def simulate_paths(problem: SwitchedProblem, schemes: tuple[str, ...], times: ja
         state = jnp.take_along_axis(jnp.stack(next_states), index[None, None, :], axis=0)[0]
 
         def reading_of(s: jax.Array, index: jax.Array) -> jax.Array:
-            return jnp.stack([rule.reading(*ssm.split(ssm.inputs(s, end)), end) for ssm in ssms])[index]
+            return jnp.stack([controller.reading(*ssm.split(ssm.inputs(s, end)), end) for ssm in ssms])[index]
 
         reading = jax.vmap(reading_of, in_axes=(1, 0))(state, index)
         reading = reading + normals(reading_key, reading.shape[1], paths).T @ reading_root.T
-        decision = jax.vmap(lambda d, r: rule.decide(d, r, end))(index, reading).astype(index.dtype)
+        decision = jax.vmap(lambda d, r: controller.decide(d, r, end))(index, reading).astype(index.dtype)
         next_index = jnp.where(is_decision, decision, index)
         return (state, next_index), (state, index, next_index)
 

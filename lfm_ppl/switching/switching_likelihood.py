@@ -4,7 +4,7 @@
 2. `log_prob` runs the filter of all regimes, in which the states are merged by their moments (`switching.regimes`).
 3. `smooth` gives probabilities of the regimes and moments of the state, as averages over draws of regimes.
 4. `sample_path` draws states and regimes given the data; `lfm_ppl.fit` stores such paths.
-5. `sample` simulates the real model by `switching.switched_simulation`, with the chain as its rule.
+5. `sample` simulates the real model by `switching.switched_simulation`, with the chain as its controller.
 
 Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8); Lindsten and others (2016), IEEE
 Journal of Selected Topics in Signal Processing 10(2).
@@ -245,7 +245,7 @@ class Switching(SeriesLikelihood):
         return filter_regimes(self.regimes(), y).log_likelihood[jnp.asarray(self.time_grid.observed)]
 
     def convergence(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return whether sites converge, of which there are none, and whether the log density is finite."""
+        """Return whether factors converge, of which there are none, and whether the log density is finite."""
         return jnp.asarray(True), jnp.isfinite(self._one_step_ahead(y).sum())
 
     def filter(self, y: Any) -> Any:

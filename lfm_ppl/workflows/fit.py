@@ -39,10 +39,10 @@ from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.inference.start_failure import start_failure
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results import checkpoint as checkpoints
-from lfm_ppl.results.checkpoint import Checkpoint
 from lfm_ppl.results.layout import Labels, checked_truth
 from lfm_ppl.results.series import SERIES
+from lfm_ppl.storage import checkpoint as checkpoints
+from lfm_ppl.storage.checkpoint import Checkpoint
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import waiting
 from lfm_ppl.utils.types import Result, Times
@@ -72,6 +72,7 @@ from lfm_ppl.workflows.fit_results import (
     SiteProblem,
     best_effort,
     build_result,
+    finished_result,
     note_warnings,
     post_process,
     write_result,
@@ -290,7 +291,7 @@ def fit(
     store = None
     if checkpoint is not None:
         record = options.record(bound, digest)
-        if resume and (finished := checkpoints.finished_result(checkpoint, record)) is not None:
+        if resume and (finished := finished_result(checkpoint, record)) is not None:
             return finished
         store = checkpoints.begin_or_resume(checkpoint, record, resume)
     if progress:

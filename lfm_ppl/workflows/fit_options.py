@@ -18,7 +18,7 @@ from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.likelihoods.priors import assumptions, prior_interval, without_parameters
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
-from lfm_ppl.results import run_record
+from lfm_ppl.storage import run_record
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.random_keys import split_by_name
 
@@ -113,7 +113,7 @@ def likelihood_settings(example: SeriesLikelihood) -> dict[str, Any]:
     """Return the attributes of a result on the likelihood of one site."""
     return {
         **example.recorded_settings, "likelihood": example.description,
-        **({"sites": example.sites_in_words} if example.sites_in_words else {}),
+        **({"factors": example.factors_in_words} if example.factors_in_words else {}),
         **({"constraints": example.constraints_in_words} if example.constraints_in_words else {}),
     }  # fmt: skip
 

@@ -1,8 +1,8 @@
 """Post-processing of the draws of `lfm_ppl.fit`, and the result.
 
 1. Score the observations under every draw, and replicate them.
-2. Diagnose the likelihood: convergence of the sites, weights under constraints, resolution of the forces, and the error
-   of the Gaussian approximation.
+2. Diagnose the likelihood: convergence of the factors, weights under constraints, resolution of the forces, and the
+   error of the Gaussian approximation.
 3. Draw a trajectory for some draws of each chain.
 4. Lay out parameters, statistics, scores and trajectories as an ArviZ object with the attributes of the run.
 
@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field
 from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -27,18 +28,19 @@ import numpy as np
 from lfm_ppl.accuracy.approximation import approximation_warnings, resolution_warnings
 from lfm_ppl.accuracy.prior_conflict import prior_conflicts
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.factor_failures import factor_failures, failures_at, path_ess
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS
-from lfm_ppl.inference.site_failures import failures_at, path_ess, site_failures
 from lfm_ppl.inference.trajectories import evenly_spaced, scores, trajectories
 from lfm_ppl.io.data_set import Data
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.checkpoint import Checkpoint
-from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, TrajectoryDraws, force_periods, lay_out
 from lfm_ppl.results.predictions import SHOWN_PERIODS, repeats_often
 from lfm_ppl.results.sites import merge_sites
+from lfm_ppl.storage.checkpoint import Checkpoint, is_finished
+from lfm_ppl.storage.files import POSTERIOR
+from lfm_ppl.storage.run_record import check_same
 from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
 from lfm_ppl.utils.random_keys import split_by_name
@@ -202,7 +204,7 @@ def _log_likelihood(bound: BoundModel, scores: Any) -> np.ndarray | None:
 
 
 def _site_attributes(problem: FitProblem, draws: PosteriorDraws, values: Mapping[str, Any]) -> dict[str, str]:
-    """Return attributes on the convergence of the sites and on the weights of constrained trajectories.
+    """Return attributes on the convergence of the factors and on the weights of constrained trajectories.
 
     Of several likelihood sites the one with the most failures, or the least weights, is reported.
     """
@@ -211,15 +213,15 @@ def _site_attributes(problem: FitProblem, draws: PosteriorDraws, values: Mapping
     for bound in (site.bound for site in problem.sites.values()):
         count_failures = None
         if options.sampler in GAUSSIAN_FILTER_SAMPLERS and z is not None:
-            count_failures = partial(site_failures, bound, z, options.seed)
+            count_failures = partial(factor_failures, bound, z, options.seed)
         elif options.sampler == "map" and bound.site.example.constraints_in_words:
             count_failures = partial(failures_at, bound, values)
         if count_failures is not None:
-            failures.append(best_effort("convergence of the sites", count_failures, None))
+            failures.append(best_effort("convergence of the factors", count_failures, None))
         weights.append(best_effort("weights under the constraints", partial(path_ess, bound, values), None))
     reports: dict[str, Any] = {
-        arviz_data.SITES: max(filter(None, failures), key=lambda report: report.unconverged + report.impossible,
-                              default=None),
+        arviz_data.FACTORS: max(filter(None, failures), key=lambda report: report.unconverged + report.impossible,
+                                default=None),
         arviz_data.WEIGHTS: min(filter(None, weights), key=lambda report: report.least, default=None)}
     return {name: json.dumps(astuple(report)) for name, report in reports.items() if report is not None}
 
@@ -357,3 +359,21 @@ def note_warnings(result: Any, likelihood_warnings: Sequence[str] = ()) -> list[
     convergence_warnings = arviz_data.convergence_warnings(result)
     result.attrs["warnings"] = json.dumps([*convergence_warnings, *likelihood_warnings])
     return convergence_warnings
+
+
+def finished_result(folder: str | Path, record: Mapping[str, Any]) -> Any:
+    """Return the result of a finished run; None for an unfinished one.
+
+    Raises:
+        ValueError: it is the result of another run; the message lists the differences.
+    """
+    path = Path(folder) / POSTERIOR
+    if not is_finished(folder):
+        return None
+    result = arviz_data.load(path)
+    run = arviz_data.attributes(result).get("run")
+    if not isinstance(run, Mapping):
+        raise ValueError(f"{path} has no record of its run, which cannot be resumed. Start a new run in another "
+                         "folder.")
+    check_same(folder, run, record)
+    return result

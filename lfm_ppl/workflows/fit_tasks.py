@@ -20,7 +20,7 @@ from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.io.data_set import Data, model_keywords
 from lfm_ppl.parallel.task import Task
 from lfm_ppl.results.packing import pack_result
-from lfm_ppl.results.run_record import digest
+from lfm_ppl.storage.run_record import digest
 from lfm_ppl.utils import checks
 from lfm_ppl.workflows.fit import fit
 

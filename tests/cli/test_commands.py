@@ -14,9 +14,9 @@ import pytest
 
 from lfm_ppl import cli
 from lfm_ppl.cli import choices, folders, main
-from lfm_ppl.experiments import catalogue
 from lfm_ppl.io import loading
 from lfm_ppl.results import arviz_data
+from lfm_ppl.studies import catalogue
 
 ROOT = Path(__file__).resolve().parents[2]
 FIGURES = {"fit.png", "states.png", "trace.png", "residuals.png"}

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pandas as pd
 import pytest
 
-from lfm_ppl.experiments import catalogue
-from lfm_ppl.experiments.study import Study, StudyResult, StudyTable, option_fields
+from lfm_ppl.studies import catalogue
+from lfm_ppl.studies.declaration import Study, StudyResult, StudyTable, option_fields
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_without_a_name_it_lists_the_studies(run):
 def test_the_help_of_a_study_has_an_option_for_each_setting(run, name):
     status, out, err = run(f"compare {name} --help")
     assert status == 0 and err == "" and f"options of {name}:" in out
-    for field, _ in option_fields(catalogue.experiment(name).study.settings):
+    for field, _ in option_fields(catalogue.entry(name).study.settings):
         assert f"--{field.name.replace('_', '-')}" in out
         assert all(alias in out for alias in field.metadata["declaration"].aliases)
 

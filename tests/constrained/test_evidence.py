@@ -111,7 +111,7 @@ def test_nothing_observed_has_probability_one():
 
 @pytest.mark.slow
 def test_the_derivative_is_that_of_differences():
-    """Sites are held fixed in it; the random numbers' part of their dependence is all that is left out."""
+    """Factors are held fixed in it; the random numbers' part of their dependence is all that is left out."""
     log_prob, y = small()
     gradient = jax.jit(jax.grad(log_prob, argnums=(1, 2)))(y, 0.8, 0.1)
     for index, step in enumerate(np.eye(2) * 1e-4):

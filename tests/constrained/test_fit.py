@@ -17,7 +17,7 @@ from systems import Linear, whole_state
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.constrained.augmented import COARSE, build_rows
-from lfm_ppl.inference.site_failures import failures_at, path_ess
+from lfm_ppl.inference.factor_failures import failures_at, path_ess
 from lfm_ppl.results import arviz_data, convergence, tables
 
 TIMES = np.linspace(0.0, 3.0, 4)
@@ -66,13 +66,13 @@ def result(**attrs):
 def test_what_a_result_under_constraints_says(sampler):
     """In its warnings, and in each row of the summary."""
     base = {"sampler": sampler, "constraints": "factor >= 0 at 6 times"}
-    good = result(**base, site_failures="[100, 0, 1]", constraint_weights="[256, 40.0, 3.0]")
+    good = result(**base, factor_failures="[100, 0, 1]", constraint_weights="[256, 40.0, 3.0]")
     assert not arviz_data.convergence_warnings(good)
-    bad = result(**base, site_failures="[100, 7, 9]", constraint_weights="[256, 3.0, 1.2]")
-    sites, weights = arviz_data.convergence_warnings(bad)
-    assert "7 of 100" in sites and "256" in weights and "0.6" in weights
+    bad = result(**base, factor_failures="[100, 7, 9]", constraint_weights="[256, 3.0, 1.2]")
+    factors, weights = arviz_data.convergence_warnings(bad)
+    assert "7 of 100" in factors and "256" in weights and "0.6" in weights
     for warning in tables.annotate(arviz_data.summary(bad), bad)["warnings"]:
-        assert sites in warning and weights in warning
+        assert factors in warning and weights in warning
     for few in ("[2, 2.0, 2.0]", "[256, 0.0, 0.0]"):
         assert len(arviz_data.convergence_warnings(result(**base, constraint_weights=few))) == 1
 
@@ -89,8 +89,8 @@ def test_the_error_of_an_evidence_is_that_of_its_logarithm_over_many_sets_of_wei
 
 
 @pytest.mark.slow
-def test_unconverged_sites_and_light_weights_are_counted():
-    """The weights of 2 trajectories are worth at most 2; sites converge nowhere at a lengthscale that is no number."""
+def test_unconverged_factors_and_light_weights_are_counted():
+    """The weights of 2 trajectories are worth at most 2; factors converge nowhere at a lengthscale of NaN."""
     bound = lfm.bind(bounded, TIMES, Y, draws=2, grid=TIMES)
     values = {"lengthscale": np.array([0.5, 1.0, np.nan, 2.0])}
     assert failures_at(bound, values) == (4, 1, 1)
@@ -112,7 +112,7 @@ def test_a_fit_stores_and_says_it(tmp_path):
         result = lfm.fit(lambda times, y=None: bounded(times, y, 16, 31), TIMES, Y, sampler="ram", chains=2, warmup=50,
                          samples=50, trajectory_draws=0, progress=False)
     attrs = arviz_data.attributes(result)
-    assert attrs["constraints"] == "factor >= 0 at 31 times" and json.loads(attrs["site_failures"])[0] == 100
+    assert attrs["constraints"] == "factor >= 0 at 31 times" and json.loads(attrs["factor_failures"])[0] == 100
     assert any("weighted trajectories" in warning for warning in json.loads(attrs["warnings"]))
 
 
@@ -145,7 +145,7 @@ def test_the_command_line_chooses_the_times(tmp_path, monkeypatch, capsys):
     assert "factor >= 0 at 7 times" in capsys.readouterr().out
     result = lfm.load("out")
     attrs = arviz_data.attributes(result)
-    assert attrs["constraints"] == "factor >= 0 at 7 times" and json.loads(attrs["site_failures"]) == [40, 0, 0]
+    assert attrs["constraints"] == "factor >= 0 at 7 times" and json.loads(attrs["factor_failures"]) == [40, 0, 0]
     trajectories, median, _ = json.loads(attrs["constraint_weights"])
     assert trajectories == 256 and median > 10 and not arviz_data.convergence_warnings(result)
     # The forecast goes on with the same times.

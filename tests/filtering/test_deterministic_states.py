@@ -140,7 +140,7 @@ def test_a_conserved_sum_of_uncertain_states_is_deterministic():
 
 
 @pytest.mark.slow
-def test_sites_converge_in_any_unit():
+def test_factors_converge_in_any_unit():
     """Precisions of 1e-24 to 1e24, and a predictor that is far from zero."""
     def log_prob(unit, level):
         model = lfm.LatentForceModel(
@@ -202,11 +202,11 @@ def law_of_all(theta, f, y):
         stats.norm.logpdf(y[7], f, noise)])
 
 
-@pytest.mark.parametrize("sites", [None, pytest.param("variational", marks=pytest.mark.slow),
-                                   pytest.param("laplace", marks=pytest.mark.slow)])
-def test_all_families_add_their_densities(sites):
+@pytest.mark.parametrize("factors", [None, pytest.param("variational", marks=pytest.mark.slow),
+                                     pytest.param("laplace", marks=pytest.mark.slow)])
+def test_all_families_add_their_densities(factors):
     def log_prob(theta):
-        return lfm.MarginalLikelihood(decay(theta, all_families(theta)), TIMES, sites=sites).log_prob(ALL)
+        return lfm.MarginalLikelihood(decay(theta, all_families(theta)), TIMES, factors=factors).log_prob(ALL)
 
     assert without_warnings(lambda: float(log_prob(THETA))) == pytest.approx(float(exact_rows(THETA).sum()), rel=1e-12)
     gradient = jax.jit(jax.grad(log_prob))(THETA)

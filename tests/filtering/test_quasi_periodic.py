@@ -12,6 +12,7 @@ from systems import Linear, first_state, softplus
 
 import lfm_ppl as lfm
 from lfm_ppl import forces
+from lfm_ppl.studies.periodic_kernels.resonators import resonators
 
 # Few functions make small tests.
 pytestmark = pytest.mark.filterwarnings("ignore:a periodic force keeps")
@@ -125,7 +126,7 @@ def test_gradients_of_the_likelihood_are_finite_differences():
 def test_a_resonator_with_a_bias_is_that_of_dense_algebra():
     """Noise, damping and a mean; and the same for the sum that carries a kernel."""
     for force in (lfm.Resonator(3.0, 0.8, 0.3, 0.1, mean=1.5),
-                  forces.resonators(kernel(), functions=5, noise=0.2, damping=0.1, mean=1.5)):
+                  resonators(kernel(), functions=5, noise=0.2, damping=0.1, mean=1.5)):
         reference = dense("constant")
         covariance = eqx.filter_jit(force.covariance)
         reference.process.kernels = [lambda t, s, covariance=covariance: np.asarray(covariance(t, s))]

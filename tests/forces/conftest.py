@@ -13,9 +13,9 @@ import pytest
 
 from lfm_ppl.forces import (  # isort: skip
     CQM, SQM, WQM, Constant, Force, Matern, ModeratedPeriodicMatern, Periodic, PeriodicMatern,
-    PeriodicSquaredExponential, QuasiPeriodic, RandomWalk, Resonator, SparseSpectrum, SquaredExponential,
-    WienerVelocity)
+    PeriodicSquaredExponential, QuasiPeriodic, RandomWalk, Resonator, SquaredExponential, WienerVelocity)
 from lfm_ppl.forces.shared_state import in_state_of
+from lfm_ppl.studies.periodic_kernels.sparse_spectrum import SparseSpectrum
 
 # Functions of (scale, lengthscale). A new force is covered by a line here.
 FORCES = {

@@ -8,6 +8,8 @@ import pytest
 import lfm_ppl as lfm
 from lfm_ppl import forces
 from lfm_ppl.forces import Constant, Matern, SquaredExponential, Sum, WienerVelocity
+from lfm_ppl.studies.periodic_kernels.resonators import resonators
+from lfm_ppl.studies.periodic_kernels.sparse_spectrum import SparseSpectrum
 
 KERNEL = forces.PeriodicSquaredExponential(1.0, 1.0, 10.0)
 VALUES = [
@@ -35,11 +37,11 @@ VALUES = [
     (lambda: lfm.Periodic(KERNEL, gamma=2.0), "gamma"),
     (lambda: lfm.Periodic(KERNEL, functions=7, explained_variance=99), "explained_variance"),
     (lambda: lfm.QuasiPeriodic(KERNEL, Matern(1.0, 1.0, mean=2.0)), "evolution"),
-    (lambda: forces.resonators(forces.ModeratedPeriodicMatern(1.0, 1.0, 5.0)), "'ModeratedPeriodicMatern'"),
+    (lambda: resonators(forces.ModeratedPeriodicMatern(1.0, 1.0, 5.0)), "'ModeratedPeriodicMatern'"),
     (lambda: forces.PeriodicKernel(lambda t, s: t - s, 5.0), "symmetric"),
     (lambda: forces.PeriodicKernel(lambda t, s: jnp.exp(-((t - s) ** 2)), 5.0, stationary=True), "stationary"),
     (lambda: forces.PeriodicKernel(lambda t, s: 1.0, 5.0), "elementwise"),
-    (lambda: forces.SparseSpectrum(1.0, np.ones((2, 2))), "frequencies"),
+    (lambda: SparseSpectrum(1.0, np.ones((2, 2))), "frequencies"),
     (lambda: jax.jit(lambda p: lfm.Periodic(forces.PeriodicMatern(1.0, 1.0, p)).eigenvalues())(24.0), "functions"),
 ]
 TYPES = [

@@ -14,6 +14,8 @@ import lfm_ppl as lfm
 from lfm_ppl import forces
 from lfm_ppl.forces.basis import fourier_coefficients
 from lfm_ppl.forces.eigenspace import leading_eigenvectors
+from lfm_ppl.studies.periodic_kernels.resonators import resonators
+from lfm_ppl.studies.periodic_kernels.sparse_spectrum import SparseSpectrum, random_frequencies
 
 # Few functions make small tests.
 pytestmark = pytest.mark.filterwarnings("ignore:a periodic force keeps")
@@ -152,8 +154,8 @@ def test_the_published_comparison():
     for count in (22, 88):
         off = []
         for seed in range(10):
-            frequencies = forces.random_frequencies(jax.random.key(seed), prior, count)
-            random = forces.SparseSpectrum(1.0, frequencies).covariance(window)
+            frequencies = random_frequencies(jax.random.key(seed), prior, count)
+            random = SparseSpectrum(1.0, frequencies).covariance(window)
             off.append(np.abs(np.asarray(random) - exact[0]).max())
         assert np.mean(off) > 0.1
 
@@ -162,12 +164,12 @@ def test_random_frequencies_have_the_kernel_as_their_mean():
     lag, count = np.array([0.0, 0.7, 3.0, 11.0]), 100_000
     periodic = forces.PeriodicMatern(1.0, 0.7, 8.0, 1)
     for prior in (lfm.Matern(1.0, 2.0, 0), lfm.Matern(1.0, 2.0, 2), lfm.SquaredExponential(1.0, 2.0), periodic):
-        w = np.asarray(forces.random_frequencies(jax.random.key(1), prior, count))
+        w = np.asarray(random_frequencies(jax.random.key(1), prior, count))
         exact = periodic(lag) if prior is periodic else prior.covariance(lag)
         waves = np.cos(lag[:, None] * w)
         error = waves.std(axis=1) / np.sqrt(count)
         assert (np.abs(waves.mean(axis=1) - exact) <= 4 * error + 1e-7).all()
-        assert_allclose(forces.SparseSpectrum(1.0, w[:50]).covariance(lag), waves[:, :50].mean(axis=1), atol=1e-12)
+        assert_allclose(SparseSpectrum(1.0, w[:50]).covariance(lag), waves[:, :50].mean(axis=1), atol=1e-12)
 
 
 def kernels(p):
@@ -258,16 +260,16 @@ def test_the_covariance_of_the_state_space_form_is_that_of_the_basis():
 @pytest.mark.slow
 def test_resonators_carry_the_kernel():
     kernel = forces.PeriodicMatern(1.3, 0.7, 24.0, 1)
-    result = forces.resonators(kernel, functions=9, mean=2.0)
+    result = resonators(kernel, functions=9, mean=2.0)
     exact = lfm.Periodic(kernel, functions=9).sde_covariance(LAG[:, None], LAG)
     assert_allclose(result.covariance(LAG[:, None], LAG), exact, atol=1e-12)
     assert [float(force.period) for force in result.forces[1:]] == [24.0, 12.0, 8.0, 6.0]
     assert float(result.mean_at(5.0)) == 2.0
-    moving = forces.resonators(kernel, functions=3, noise=0.1, damping=0.02)
+    moving = resonators(kernel, functions=3, noise=0.1, damping=0.02)
     scale = float(moving.forces[1].scale)
     assert float(moving.forces[1].noise) == pytest.approx(0.1 * scale) and float(moving.forces[1].damping) == 0.02
     kernel = lambda p: forces.PeriodicMatern(1.0, 0.7, p)  # noqa: E731
-    gradient = jax.grad(lambda p: forces.resonators(kernel(p), functions=5).covariance(7.0))(24.0)
+    gradient = jax.grad(lambda p: resonators(kernel(p), functions=5).covariance(7.0))(24.0)
     expected = jax.grad(lambda p: lfm.Periodic(kernel(p), functions=5).sde_covariance(7.0))(24.0)
     assert float(gradient) == pytest.approx(float(expected), rel=1e-10)
 
@@ -275,7 +277,7 @@ def test_resonators_carry_the_kernel():
 @pytest.mark.parametrize("make, functions", [
     (lambda: lfm.Periodic(forces.PeriodicMatern(2.0, 1.0, 24.0, 1), functions=3), "functions=7"),
     (lambda: lfm.QuasiPeriodic(forces.PeriodicMatern(1.0, 1.0, 24.0, 0), forces.CQM(30.0)), "functions=65"),
-    (lambda: forces.resonators(forces.PeriodicMatern(1.0, 1.0, 24.0, 1), functions=5), "functions=7"),
+    (lambda: resonators(forces.PeriodicMatern(1.0, 1.0, 24.0, 1), functions=5), "functions=7"),
     (lambda: lfm.Periodic(forces.ModeratedPeriodicMatern(1.0, 1.0, 10.0, 0.5), functions=2), "functions=5"),
     (lambda: lfm.Periodic(forces.PeriodicMatern(1.0, 0.001, 24.0, 0), functions=3), "2049"),
 ])
@@ -290,7 +292,7 @@ def test_functions_that_keep_enough():
         warnings.simplefilter("error")
         force = lfm.Periodic(kernel, functions=7)
         lfm.Periodic(kernel, functions=3, explained_variance=0.9)
-        forces.resonators(forces.PeriodicMatern(1.0, 1.0, 24.0, 0), functions=3, explained_variance=0.0)
+        resonators(forces.PeriodicMatern(1.0, 1.0, 24.0, 0), functions=3, explained_variance=0.0)
         jax.jit(lambda ell: lfm.Periodic(forces.PeriodicMatern(1.0, ell, 24.0, 0), functions=3).eigenvalues())(1.0)
     assert float(force.eigenvalues().sum()) > 0.99 * 4.0 > float(force.eigenvalues()[jnp.array([0, 1, 2, 4, 5])].sum())
 

@@ -138,7 +138,7 @@ def test_nuts_with_expectation_propagation_is_calibrated(name, tmp_path):
 def densities(model, times, y, count, keywords=None, known=None, seed=0):
     """Return draws of the prior, and the function from them to log densities and their gradients, in one program.
 
-    One after the other: side by side all of them wait for the one whose sites take longest, with several times the
+    One after the other: side by side all of them wait for the one whose factors take longest, with several times the
     memory.
     """
     keywords = keywords or {}
@@ -169,7 +169,7 @@ def of_file(name, count):
 
 
 def assert_nearly_all_have_a_density(name, z, run):
-    """A model may be far from the data: no NaN, and fewer than one in a hundred without converged sites."""
+    """A model may be far from the data: no NaN, and fewer than one in a hundred without converged factors."""
     value, gradient = run(z)
     share = np.isneginf(value).mean()
     print(name, len(value), "share of -inf", share)

@@ -92,11 +92,11 @@ def test_moments_are_those_of_elliptical_slices(name):
 def test_coal_has_the_evidence_of_bayesnewton():
     """The same counts and hyperparameters in BayesNewton 1.3.4, an implementation of its own (111 bins)."""
     model, times, y = problem("coal 111")
-    theirs = {"ep": -175.2304464105596, lfm.SiteSettings(power=0.5): -175.2314237700023,
+    theirs = {"ep": -175.2304464105596, lfm.FactorSettings(power=0.5): -175.2314237700023,
               "variational": -175.2324063924814}
-    for sites, expected in theirs.items():
-        value = float(jax.jit(lfm.MarginalLikelihood(model, times, sites=sites).log_prob)(jnp.asarray(y, float)))
-        print(sites, value)
+    for factors, expected in theirs.items():
+        value = float(jax.jit(lfm.MarginalLikelihood(model, times, factors=factors).log_prob)(jnp.asarray(y, float)))
+        print(factors, value)
         assert value == pytest.approx(expected, abs=1e-7)
     gaussian = lfm.MarginalLikelihood(model, times)
     mean, sd = map(np.asarray, gaussian.smooth(y).force(model.force_names[0]))

@@ -49,7 +49,7 @@ def state(latent, u):
     return jax.jit(lambda u: latent.state(u))(u)
 
 
-# The linear rule is exact below.
+# The linear quadrature is exact below.
 QUICK = {(genes, "riemann")}
 
 
@@ -65,11 +65,11 @@ def solved(model, forces, start):
     return solution.y.T[np.searchsorted(np.unique(TIMES), TIMES)]
 
 
-@pytest.mark.parametrize("build, forces, rule, order", [
-    pytest.param(build, forces, rule, order, marks=() if (build, rule) in QUICK else pytest.mark.slow)
+@pytest.mark.parametrize("build, forces, quadrature, order", [
+    pytest.param(build, forces, quadrature, order, marks=() if (build, quadrature) in QUICK else pytest.mark.slow)
     for build, forces in ((genes, [path]), (oscillator, [path, lambda t: np.cos(t)]))
-    for rule, order in (("riemann", 1.0), ("trapezoid", 2.0), ("linear", 2.0))])
-def test_the_state_converges_to_that_of_an_ode_solver(build, forces, rule, order):
+    for quadrature, order in (("riemann", 1.0), ("trapezoid", 2.0), ("linear", 2.0))])
+def test_the_state_converges_to_that_of_an_ode_solver(build, forces, quadrature, order):
     """On grids that do not hold the observation times, so that the last cell is cut."""
     model = build()
     start = np.asarray(model.initial_state.mean)
@@ -78,7 +78,7 @@ def test_the_state_converges_to_that_of_an_ode_solver(build, forces, rule, order
     for points in (174, 347, 693):
         grid = np.linspace(TIMES[0], TIMES[-1], points)
         u = np.stack([np.broadcast_to(f(grid), grid.shape) for f in forces])
-        state = jax.jit(lambda u, grid=grid: LatentGrid(model, TIMES, grid, rule).state(u))(u)
+        state = jax.jit(lambda u, grid=grid: LatentGrid(model, TIMES, grid, quadrature).state(u))(u)
         errors.append(np.abs(np.asarray(state) - exact)[1:].max(axis=0))
     slowest = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))[-1]
     assert np.all(slowest > order - 0.15), (errors, slowest)
@@ -179,7 +179,7 @@ def test_errors():
         lfm.GaussianObservation(lambda x, u, t: u, jnp.ones(1)), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
     for change, name in (
             ({"points": 1}, "points"), ({"points": [0.0, 1.0, 3.0]}, "3.* 4"), ({"points": [0.5, 1.0, 5.0]}, "0.5"),
-            ({"points": [0.0, 3.0, 2.0, 5.0]}, "increase"), ({"rule": "simpson"}, "'simpson'"),
+            ({"points": [0.0, 3.0, 2.0, 5.0]}, "increase"), ({"quadrature": "simpson"}, "'simpson'"),
             ({"model": genes(process_noise=jnp.eye(3))}, "process_noise"),
             ({"model": genes(dynamics=lambda x, u, t: u[0] - x**2)}, "x0, x1, x2"),
             ({"model": genes(dynamics=lambda x, u, t: -u[0] * x)}, "x0, x1, x2"),

@@ -70,7 +70,7 @@ def test_wrong_arguments_are_named():
         numpyro.sample("y", dist.Normal(0.0, 1.0), obs=y)
 
     for compute, name in ((lambda: handlers.seed(lfm.on_latent_grid(without), 0)(TIMES, 0.3), "site"),
-                          (lambda: lfm.on_latent_grid(linear, rule="exact"), "rule"),
+                          (lambda: lfm.on_latent_grid(linear, quadrature="exact"), "quadrature"),
                           (lambda: handlers.seed(lfm.on_latent_grid(linear, points=11), 0)(TIMES, Y[1:]), r"\(6, 1\)"),
                           (lambda: jax.jit(lambda t: handlers.seed(lfm.on_latent_grid(linear), 0)(t, Y))(TIMES),
                            "traced")):

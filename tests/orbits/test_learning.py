@@ -8,10 +8,10 @@ from scipy import stats
 
 import lfm_ppl as lfm
 from lfm_ppl import orbits
-from lfm_ppl.experiments.gps import problem
 from lfm_ppl.orbits import learning, magnitudes, prediction, training
 from lfm_ppl.orbits.arc import NOISE, Arc
 from lfm_ppl.orbits.table import TimeTable
+from lfm_ppl.studies.gps import problem
 
 
 def test_common_magnitudes_are_the_mean_and_the_scatter_of_the_satellites():

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from lfm_ppl.experiments.home_heating import prediction, problem
+from lfm_ppl.studies.home_heating import prediction, problem
 
 pytestmark = pytest.mark.performance
 

@@ -13,8 +13,8 @@ import xarray as xr
 from scipy import special, stats
 
 import lfm_ppl as lfm
-from lfm_ppl.filtering.ep.settings import SiteSettings
-from lfm_ppl.inference.site_failures import site_failures
+from lfm_ppl.filtering.ep.settings import FactorSettings
+from lfm_ppl.inference.factor_failures import factor_failures
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.plots.saving import pages_of
@@ -32,10 +32,10 @@ def system(level, scale):
         output_names=("events",))
 
 
-def counts(times, y=None, sites=None):
+def counts(times, y=None, factors=None):
     level = numpyro.sample("level", dist.Normal(0.0, 1.0))
     scale = numpyro.sample("scale", dist.LogNormal(-0.5, 0.3))
-    numpyro.sample("y", lfm.MarginalLikelihood(system(level, scale), times, sites=sites), obs=y)
+    numpyro.sample("y", lfm.MarginalLikelihood(system(level, scale), times, factors=factors), obs=y)
 
 
 @pytest.fixture(scope="module")
@@ -124,22 +124,22 @@ def test_check_by_importance_sampling_and_correction(result):
     drawn = arviz_data.group(corrected, "posterior_predictive")["y"].values
     assert np.all(drawn == np.round(drawn))
     with pytest.raises(ValueError, match="log likelihoods"):
-        lfm.check_accuracy(result, lambda times, y=None: counts(times, y, SiteSettings()), TIMES, COUNTS + 1.0, draws=4,
-                           particles=10, replicates=2, progress=False)
+        lfm.check_accuracy(result, lambda times, y=None: counts(times, y, FactorSettings()), TIMES, COUNTS + 1.0,
+                           draws=4, particles=10, replicates=2, progress=False)
 
 
-def test_unconverged_sites_are_counted_and_named(result):
+def test_unconverged_factors_are_counted_and_named(result):
     """With few sweeps allowed they converge at some points and not at others."""
-    stored = json.loads(arviz_data.attributes(result)["site_failures"])
-    assert stored == [100, 0, 0] and not any("sites" in text for text in arviz_data.convergence_warnings(result))
-    bound = lfm.bind(counts, TIMES, COUNTS, sites=SiteSettings(sweeps=9))
-    computed = site_failures(bound, 2.0 * np.random.default_rng(0).normal(size=(1, 50, 2)))
+    stored = json.loads(arviz_data.attributes(result)["factor_failures"])
+    assert stored == [100, 0, 0] and not any("factors" in text for text in arviz_data.convergence_warnings(result))
+    bound = lfm.bind(counts, TIMES, COUNTS, factors=FactorSettings(sweeps=9))
+    computed = factor_failures(bound, 2.0 * np.random.default_rng(0).normal(size=(1, 50, 2)))
     assert 0 < computed.unconverged < computed.points and computed.unconverged <= computed.impossible
     for impossible in (9, 0):
-        result.attrs["site_failures"] = json.dumps([100, 7, impossible])
+        result.attrs["factor_failures"] = json.dumps([100, 7, impossible])
         message = arviz_data.convergence_warnings(result)[-1]
         assert "7 of 100" in message and ("9 of the 100" in message) == bool(impossible)
-    result.attrs["site_failures"] = json.dumps(stored)
+    result.attrs["factor_failures"] = json.dumps(stored)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Discrete inputs under a rule: Rao-Blackwellised particles against plain ones, the filter and independent algebra."""
+"""Discrete inputs: Rao-Blackwellised particles against plain ones, the filter and independent algebra."""
 
 import equinox as eqx
 import jax
@@ -216,7 +216,7 @@ def test_bad_arguments_are_named():
             (lambda: run(initial=np.zeros(3, int)), "10"), (lambda: run(particles=0), "particles"),
             (lambda: run(threshold=2.0), "threshold"), (lambda: run(decisions=[-1.0]), "-1"),
             (lambda: run(build=curved), "'x0'"),
-            (lambda: run(rule=lfm.Thermostat(20.0, sensor=lambda x, u, t: x[0] ** 2)), "linear"),
+            (lambda: run(controller=lfm.Thermostat(20.0, sensor=lambda x, u, t: x[0] ** 2)), "linear"),
             (lambda: run(build=lambda heater: house(heater) if heater else two_rooms()), "states"),
             (lambda: run(build=later), "initial state"), (lambda: run(y=np.zeros((3, 2))), "y"),
             (lambda: run(start=lfm.FilterState(0.0, jnp.zeros(5), jnp.eye(5))), "start has 5"),
@@ -224,7 +224,7 @@ def test_bad_arguments_are_named():
         with pytest.raises(ValueError, match=name):
             make()
     for make, name in (
-            (lambda: run(rule=20.0), "SwitchingRule"), (lambda: lfm.Thermostat([18.0, 20.0]), "lfm.Input"),
+            (lambda: run(controller=20.0), "Controller"), (lambda: lfm.Thermostat([18.0, 20.0]), "lfm.Input"),
             (lambda: lfm.simulate_switched(0, house, THERMOSTAT, TIMES), "key"),
             (lambda: lfm.rao_blackwellised(0, house, THERMOSTAT, TIMES), "key"),
             (lambda: lfm.Thermostat(20.0, hysteresis=np.array([1.0, 2.0])), "hysteresis")):
@@ -232,8 +232,8 @@ def test_bad_arguments_are_named():
             make()
 
 
-def run(build=house, rule=THERMOSTAT, particles=10, **keywords):
-    return lfm.rao_blackwellised(jax.random.key(0), build, rule, TIMES[:3], particles=particles, **keywords)
+def run(build=house, controller=THERMOSTAT, particles=10, **keywords):
+    return lfm.rao_blackwellised(jax.random.key(0), build, controller, TIMES[:3], particles=particles, **keywords)
 
 
 def curved(heater):

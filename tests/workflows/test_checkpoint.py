@@ -23,9 +23,10 @@ import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.samplers import SAMPLERS
-from lfm_ppl.results import arviz_data, run_record
-from lfm_ppl.results import checkpoint as checkpoints
-from lfm_ppl.results.checkpoint import Checkpoint
+from lfm_ppl.results import arviz_data
+from lfm_ppl.storage import checkpoint as checkpoints
+from lfm_ppl.storage import run_record
+from lfm_ppl.storage.checkpoint import Checkpoint
 from lfm_ppl.utils.progress import Progress
 from tests.processes import ROOT
 

@@ -515,8 +515,8 @@ def decaying_counts(times, y=None, fault=None):
                    else lfm.PoissonObservation(predictor))
     model = lfm.LatentForceModel(lambda x, u, t: slope - rate + 0 * x, {}, observation,
                                  lfm.Gaussian(jnp.array([np.log(100.0)]), jnp.zeros((1, 1))))
-    settings = {"sites": lfm.SiteSettings(sweeps=1)} if fault == "sites" else {}
-    if fault == "sites":
+    settings = {"factors": lfm.FactorSettings(sweeps=1)} if fault == "factors" else {}
+    if fault == "factors":
         model = lfm.LatentForceModel(lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)}, observation,
                                      lfm.Gaussian(jnp.array([np.log(100.0)]), jnp.zeros((1, 1))))
     numpyro.sample("y", lfm.MarginalLikelihood(model, times, **settings), obs=y)
@@ -541,7 +541,7 @@ def test_a_deterministic_state_is_fitted():
 
 @pytest.mark.parametrize("fault, reason", [
     ("factor", "'bound'"), ("function", "row 4"), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
-        ("prior", "'level'"), ("gradient", "'rate'"), ("law", "y"), ("sites", "1 sweeps")))])
+        ("prior", "'level'"), ("gradient", "'rate'"), ("law", "y"), ("factors", "1 sweeps")))])
 def test_the_part_that_fails_is_named_where_there_is_nowhere_to_start(fault, reason):
     times = 10.0 * np.arange(6.0) if fault == "law" else np.arange(6.0)
     with pytest.raises(ValueError, match=f"finite density.*{reason}") as error:

@@ -1,1 +1,1 @@
-"""Expectation propagation: Gaussian sites of observations and constraints that are not Gaussian."""
+"""Expectation propagation: Gaussian factors of observations and constraints that are not Gaussian."""

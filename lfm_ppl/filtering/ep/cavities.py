@@ -1,4 +1,4 @@
-"""Marginals of the predictor, and cavities: marginals without the entry's own site."""
+"""Marginals of the predictor, and cavities: marginals without the entry's own factor."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import jax.numpy as jnp
 
 from lfm_ppl.filtering.backward import SmoothedPredictor
 from lfm_ppl.filtering.ep.quadrature import MeanVariance
-from lfm_ppl.filtering.update import Sites
+from lfm_ppl.filtering.update import Factors
 from lfm_ppl.utils.linalg import diagonal
 
 _DOMINANT_SITE = 0.5
-"""Share of the marginal's precision from its own site, above which the cavity is taken from leave-one-out terms."""
+"""Share of the marginal's precision from its own factor, above which the cavity is taken from leave-one-out terms."""
 
 
-class SiteMarginals(NamedTuple):
-    """Marginals of the predictor (T, D), with and without an entry's site.
+class FactorMarginals(NamedTuple):
+    """Marginals of the predictor (T, D), with and without an entry's factor.
 
     Attributes:
-        cavity: without the site (to its power).
+        cavity: without the factor (to its power).
         marginal: with it.
         valid: whether both have a positive variance.
-        deterministic: whether the predictor has no variance: it has no site, and its factor is log p at its mean.
+        deterministic: whether the predictor has no variance: it has no factor, and its term is log p at its mean.
     """
 
     cavity: MeanVariance
@@ -32,21 +32,21 @@ class SiteMarginals(NamedTuple):
     deterministic: jax.Array
 
 
-def cavities(predictor: SmoothedPredictor, sites: Sites, present: jax.Array, power: float) -> SiteMarginals:
-    """Remove an entry's own site, to a power, from its marginal.
+def cavities(predictor: SmoothedPredictor, factors: Factors, present: jax.Array, power: float) -> FactorMarginals:
+    """Remove an entry's own factor, to a power, from its marginal.
 
-    With s = 1 - a tau v the cavity has the variance v / s and, from c, the mean (m - a v nu) / s. Where a site
+    With s = 1 - a tau v the cavity has the variance v / s and, from c, the mean (m - a v nu) / s. Where a factor
     outweighs all other information these are differences of nearly equal numbers, and the leave-one-out terms of the
     smoother, s = C / tau and the mean (nu - u / s) / tau, are not.
 
     Args:
         predictor: smoothed, (T, ...).
-        sites: (T, D) each.
+        factors: (T, D) each.
         present: (T, D).
         power: a.
     """
-    m, v = predictor.mean - sites.centre, diagonal(predictor.covariance)
-    nu, tau = sites.nu, sites.tau
+    m, v = predictor.mean - factors.centre, diagonal(predictor.covariance)
+    nu, tau = factors.nu, factors.tau
     deterministic = is_deterministic(predictor.mean, jnp.abs(v))
     v = jnp.where(deterministic, placeholder_variance(predictor.mean), v)
     share = jnp.where(deterministic, 0.0, power * tau * v)
@@ -59,8 +59,8 @@ def cavities(predictor: SmoothedPredictor, sites: Sites, present: jax.Array, pow
     mean = jnp.where(deterministic, m, mean)
     v = jnp.where(valid, v, 1.0)
     marginal = MeanVariance(jnp.where(valid, predictor.mean, 0.0), v)
-    cavity = MeanVariance(jnp.where(valid, sites.centre + mean, 0.0), v / remaining)
-    return SiteMarginals(cavity, marginal, valid | ~present, deterministic)
+    cavity = MeanVariance(jnp.where(valid, factors.centre + mean, 0.0), v / remaining)
+    return FactorMarginals(cavity, marginal, valid | ~present, deterministic)
 
 
 def is_deterministic(mean: jax.Array, variance: jax.Array) -> jax.Array:
@@ -80,11 +80,11 @@ def with_positive_variance(mean: jax.Array, variance: jax.Array) -> MeanVariance
     return MeanVariance(mean, jnp.where(is_deterministic(mean, variance), placeholder_variance(mean), variance))
 
 
-def is_valid(predictor: SmoothedPredictor, cavity: SiteMarginals) -> jax.Array:
+def is_valid(predictor: SmoothedPredictor, cavity: FactorMarginals) -> jax.Array:
     """Return whether a sweep is finite and every entry has a cavity."""
     return jnp.isfinite(predictor.mean).all() & jnp.isfinite(predictor.covariance).all() & cavity.valid.all()
 
 
-def clip_to_proper(sites: Sites) -> Sites:
-    """Return the sites of positive precision, under which every entry has a cavity; the others become empty."""
-    return sites._replace(nu=jnp.where(sites.tau > 0, sites.nu, 0.0), tau=jnp.maximum(sites.tau, 0.0))
+def clip_to_proper(factors: Factors) -> Factors:
+    """Return the factors of positive precision, under which every entry has a cavity; the others become empty."""
+    return factors._replace(nu=jnp.where(factors.tau > 0, factors.nu, 0.0), tau=jnp.maximum(factors.tau, 0.0))

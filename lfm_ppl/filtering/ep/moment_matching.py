@@ -1,10 +1,10 @@
-"""Sites from the prediction of a row: assumed density filtering, the first pass of expectation propagation.
+"""Factors from the prediction of a row: assumed density filtering, the first pass of expectation propagation.
 
 1. The entries of a row are taken one after the other, each with the prediction given the earlier ones as its cavity.
 2. The mode of the tilted distribution, by a safeguarded Newton search, locates the nodes of a quadrature, whose moments
    locate the nodes of a second quadrature.
-3. The site is the ratio of the Gaussian of the tilted moments and the cavity. Prediction times sites has the moments of
-   the last tilted distribution: a positive definite covariance, whatever the signs of the precisions.
+3. The factor is the ratio of the Gaussian of the tilted moments and the cavity. Prediction times factors has the
+   moments of the last tilted distribution: a positive definite covariance, whatever the signs of the precisions.
 4. The product of the entries' Z is a density of the row, given the rows before.
 
 Where the density of the data is not log-concave a tilted distribution far from the data may have two modes. The
@@ -30,11 +30,11 @@ from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals
 from lfm_ppl.filtering.update import (
+    Factors,
     LinearizedObservation,
     RowUpdate,
-    Sites,
     Update,
-    multiply_by_sites,
+    multiply_by_factors,
     predictor_variance,
 )
 from lfm_ppl.model.observation_noise import row_log_prob
@@ -48,20 +48,20 @@ _START_DISTANCES = np.concatenate([-(2.0 ** np.arange(6)), 2.0 ** np.arange(6)])
 """Starts of the search in standard deviations from the mean, where the density at the mean is zero."""
 
 NEARLY_CONSTANT = 1e-13
-"""Relative changes of a cavity's mean, squared, and of its variance, below which its factor is nearly constant."""
+"""Relative changes of a cavity's mean, squared, and of its variance, below which its term is nearly constant."""
 
 _FAR = 1e3
-"""Distance in standard deviations from which a site's centre is moved."""
+"""Distance in standard deviations from which a factor's centre is moved."""
 
 _LARGEST_ROUNDING = 1e-10
-"""Rounding error of nu, in units of the marginal, from which a site's centre is moved: far below the tolerance."""
+"""Rounding error of nu, in units of the marginal, from which a factor's centre is moved: far below the tolerance."""
 
 _LEAST_PROBABILITY = 1e-15
 """Least probability of a residual, which then is -7.9."""
 
 
 class MomentMatchingUpdate(NamedTuple):
-    """Multiply with sites that have the moments of the row's tilted prediction.
+    """Multiply with factors that have the moments of the row's tilted prediction.
 
     Attributes:
         family: the observation family.
@@ -80,15 +80,15 @@ class MomentMatchingUpdate(NamedTuple):
 
         def update(observation: LinearizedObservation, index: jax.Array, y: jax.Array, predicted: Moments) -> Update:
             variance = predictor_variance(observation, predicted)
-            sites, log_likelihood = row_sites(self.family, observation.value, variance, index, y)
-            return multiply_by_sites(observation, sites, predicted)._replace(log_likelihood=log_likelihood)
+            factors, log_likelihood = row_factors(self.family, observation.value, variance, index, y)
+            return multiply_by_factors(observation, factors, predicted)._replace(log_likelihood=log_likelihood)
 
         return update
 
 
-def row_sites(family: ObservationFamily, mean: jax.Array, covariance: jax.Array, row: jax.Array,
-              y: jax.Array) -> tuple[Sites, jax.Array]:
-    """Return the sites (D,) of a row and log p(y_k | y_1:k-1).
+def row_factors(family: ObservationFamily, mean: jax.Array, covariance: jax.Array, row: jax.Array,
+                y: jax.Array) -> tuple[Factors, jax.Array]:
+    """Return the factors (D,) of a row and log p(y_k | y_1:k-1).
 
     Args:
         family: the observation family.
@@ -107,7 +107,7 @@ def row_sites(family: ObservationFamily, mean: jax.Array, covariance: jax.Array,
 
         cavity, tilted = jax.tree.map(lambda a: a[0], tilted_prediction(log_prob, middle[None], spread[None]))
         deterministic = is_deterministic(middle, spread)
-        # A quadrature has the value of a nearly constant factor, but not its slope.
+        # A quadrature has the value of a nearly constant term, but not its slope.
         is_flat = ((tilted.shift**2 < NEARLY_CONSTANT * cavity.variance)
                    & (jnp.abs(tilted.variance - cavity.variance) < NEARLY_CONSTANT * cavity.variance))
         log_partition = jnp.where(deterministic | is_flat, log_prob(middle[None])[0], tilted.log_partition)
@@ -116,18 +116,18 @@ def row_sites(family: ObservationFamily, mean: jax.Array, covariance: jax.Array,
         shift = jnp.where(usable, tilted.shift, 0.0)
         gain = covariance[:, index] / cavity.variance
         moments = m + gain * shift, covariance + jnp.outer(gain, gain) * (variance - cavity.variance)
-        sites = sites_of_moments(MeanVariance(middle, cavity.variance), shift, variance)
-        return moments, (sites, jnp.where(jnp.isfinite(y[index]), log_partition, 0.0))
+        factors = factors_of_moments(MeanVariance(middle, cavity.variance), shift, variance)
+        return moments, (factors, jnp.where(jnp.isfinite(y[index]), log_partition, 0.0))
 
     if mean.shape[0] == 1:
-        sites, log_partition = jax.tree.map(lambda a: a[None], entry((mean, covariance), 0)[1])
+        factors, log_partition = jax.tree.map(lambda a: a[None], entry((mean, covariance), 0)[1])
     else:
-        sites, log_partition = jax.lax.scan(entry, (mean, covariance), jnp.arange(mean.shape[0]))[1]
-    return sites, log_partition.sum()
+        factors, log_partition = jax.lax.scan(entry, (mean, covariance), jnp.arange(mean.shape[0]))[1]
+    return factors, log_partition.sum()
 
 
-def sites_of_moments(cavity: MeanVariance, shift: jax.Array, variance: jax.Array) -> Sites:
-    """Return the sites by which a cavity gets other moments: the mean changes by ``shift``, arrays of one shape.
+def factors_of_moments(cavity: MeanVariance, shift: jax.Array, variance: jax.Array) -> Factors:
+    """Return the factors by which a cavity gets other moments: the mean changes by ``shift``, arrays of one shape.
 
     The centre is the cavity's mean, or the new mean where that is many sds away: nu would be a large number there, and
     log evidences differences of its squares. The same holds where the rounding of a predictor, as a share of the sd,
@@ -136,8 +136,8 @@ def sites_of_moments(cavity: MeanVariance, shift: jax.Array, variance: jax.Array
     eps = jnp.finfo(variance.dtype).eps
     is_far = ((shift**2 > _FAR**2 * variance)
               | (eps * jnp.abs(shift * (cavity.mean + shift)) > _LARGEST_ROUNDING * variance))
-    return Sites(jnp.where(is_far, cavity.mean + shift, cavity.mean),
-                 shift / jnp.where(is_far, cavity.variance, variance), 1.0 / variance - 1.0 / cavity.variance)
+    return Factors(jnp.where(is_far, cavity.mean + shift, cavity.mean),
+                   shift / jnp.where(is_far, cavity.variance, variance), 1.0 / variance - 1.0 / cavity.variance)
 
 
 def tilted_prediction(log_prob: Callable, mean: jax.Array, variance: jax.Array) -> tuple[MeanVariance, TiltedMoments]:
@@ -229,11 +229,11 @@ class PrequentialResult(NamedTuple):
 
 
 def assumed_density_filter(problem: FilterProblem, y: jax.Array, initial: Moments | None = None) -> PrequentialResult:
-    """Filter data of a family: the site of each observation is made from its prediction, once."""
+    """Filter data of a family: the factor of each observation is made from its prediction, once."""
     updater = MomentMatchingUpdate(observation_family(problem), y)
     trace = forward(problem, updater, initial=initial, record=Record.MOMENTS)
     at_data = at_intervals(trace._replace(initial=None), problem.grid.observed)
-    terms = at_data.update.site_terms
+    terms = at_data.update.factor_terms
     return PrequentialResult(at_data.log_likelihood, trace,
                              with_positive_variance(terms.value, diagonal(terms.variance)))
 

@@ -1,4 +1,4 @@
-"""Settings of the sites, and of the search for their fixed point."""
+"""Settings of the factors, and of the search for their fixed point."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from lfm_ppl.utils import checks
 METHODS = ("ep", "variational", "laplace")
 
 
-class SiteSettings(NamedTuple):
-    """How sites are refined; hashable, so that it can be a static argument of compiled code.
+class FactorSettings(NamedTuple):
+    """How factors are refined; hashable, so that it can be a static argument of compiled code.
 
     Attributes:
         method: "ep", "variational" or "laplace".
         power: a of power EP, in (0, 1].
-        damping: fraction of each new site that is taken at first; it is halved where changes grow.
+        damping: fraction of each new factor that is taken at first; it is halved where changes grow.
         sweeps: largest number of sweeps.
-        relinearisations: sweeps in which the sites and the points of linearisation are refined together, before the
+        relinearisations: sweeps in which the factors and the points of linearisation are refined together, before the
             points are held fixed; for non-linear models.
     """
 
@@ -33,16 +33,16 @@ class SiteSettings(NamedTuple):
 class FixedPointOptions:
     """Constants of the fixed-point iteration.
 
-    Changes of a site are measured in units of its marginal: nu times the standard deviation, tau times the variance.
+    Changes of a factor are measured in units of its marginal: nu times the standard deviation, tau times the variance.
 
     Attributes:
-        tolerance: largest change of a converged site.
+        tolerance: largest change of a converged factor.
         memory: sweeps that Anderson's acceleration uses; more do not save sweeps.
         coarse_change: change above which the first sweeps use a coarse quadrature.
         coarse_sweeps: largest number of such sweeps.
         growing_sweeps: first sweeps, in which changes may grow.
         linear_change: change below which the map of a sweep is nearly linear, and its steps are accelerated.
-        sweeps_without_cavity: sweeps without any valid cavity after which the search restarts from empty sites.
+        sweeps_without_cavity: sweeps without any valid cavity after which the search restarts from empty factors.
         patience: sweeps after which the damping grows while changes are large.
         smallest_fraction: damped fraction below which the search ends.
     """
@@ -58,21 +58,21 @@ class FixedPointOptions:
     smallest_fraction: float = 1e-4
 
 
-def as_settings(sites: Any, iterations: int = 0) -> SiteSettings:
-    """Return the settings of the sites.
+def as_settings(factors: Any, iterations: int = 0) -> FactorSettings:
+    """Return the settings of the factors.
 
     Args:
-        sites: settings, the name of a method, or None for expectation propagation.
+        factors: settings, the name of a method, or None for expectation propagation.
         iterations: number of posterior linearisations, the joint sweeps of a non-linear model; 0: that of the settings.
 
     Raises:
         ValueError, TypeError: an unknown method, or a number out of its range.
     """
-    settings = sites if isinstance(sites, SiteSettings) else SiteSettings("ep" if sites is None else sites)
-    checks.one_of("method of the sites", settings.method, METHODS)
+    settings = factors if isinstance(factors, FactorSettings) else FactorSettings("ep" if factors is None else factors)
+    checks.one_of("method of the factors", settings.method, METHODS)
     for name in ("power", "damping"):
         if not 0.0 < getattr(settings, name) <= 1.0:
-            raise ValueError(f"{name} of the sites must lie in (0, 1], got {getattr(settings, name)}.")
+            raise ValueError(f"{name} of the factors must lie in (0, 1], got {getattr(settings, name)}.")
     if settings.method != "ep" and settings.power != 1.0:
         raise ValueError(f"power={settings.power} applies to expectation propagation only; leave it out with method "
                          f"{settings.method!r}.")

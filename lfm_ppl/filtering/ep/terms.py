@@ -1,4 +1,4 @@
-"""Factors that sites approximate: one function of the predictor for each entry of the data, or for each constraint."""
+"""Exact terms that factors approximate: a function of the predictor for each entry of the data or each constraint."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from lfm_ppl.model.observations.family import ObservationFamily
 
 
 class EntryTerms(Protocol):
-    """Factors p_i(f_i) of arrays (T, D). An entry without a factor has log Z = 0."""
+    """Exact terms p_i(f_i) of arrays (T, D). An entry without a term has log Z = 0."""
 
     def tilted(self, cavity: MeanVariance, centre: MeanVariance, power: float) -> TiltedMoments:
         """Return log int N(f; cavity) p(f)^power df, and mean and variance of the normalised product; (T, D) each.
 
         Args:
-            cavity: mean and variance of each entry given all other factors.
+            cavity: mean and variance of each entry given the factors of all others.
             centre: its present marginal, the location and width of the product for a quadrature.
-            power: of the factor.
+            power: of the term.
         """
 
     @property
     def present(self) -> jax.Array:
-        """Whether an entry has a factor, (T, D)."""
+        """Whether an entry has a term, (T, D)."""
 
 
 class FamilyTerms(eqx.Module):
-    """Factors of data under an observation family.
+    """Exact terms of data under an observation family.
 
     Attributes:
         family: the observation family.

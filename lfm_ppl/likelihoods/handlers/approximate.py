@@ -10,7 +10,7 @@ from lfm_ppl.likelihoods.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.likelihoods.likelihood import Likelihood
 from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 
-NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "method", "sites", "lower", "upper",
+NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "method", "factors", "lower", "upper",
          "constraints", "grid", "draws")
 
 
@@ -20,7 +20,7 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
     Args:
         fn: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
         **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping``, ``tolerance``, ``method``,
-            ``sites``, ``lower``, ``upper``, ``constraints``, ``grid`` and ``draws``; what is None or left out
+            ``factors``, ``lower``, ``upper``, ``constraints``, ``grid`` and ``draws``; what is None or left out
             stays as the model has it. But ``steps`` or ``iterations`` without a tolerance remove the tolerance of the
             model, and a tolerance or constraints remove its iterations.
 

@@ -13,7 +13,7 @@ import numpyro.distributions as dist
 from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
-from lfm_ppl.latent_grid.latent_grid import RULES, LatentGrid
+from lfm_ppl.latent_grid.latent_grid import QUADRATURES, LatentGrid
 from lfm_ppl.likelihoods.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.likelihoods.likelihood import Likelihood
 from lfm_ppl.likelihoods.panel import Panel
@@ -52,13 +52,13 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
     A site ``y`` with ``lfm.MarginalLikelihood`` becomes: ``y_white`` (R, G), independent standard normal; ``y_start``
     (M,) likewise, for the initial state, on which nothing depends where that is known; ``y_forces`` (R, G),
     deterministic; and ``y`` given these. The posterior of all other sites is that of the model itself, without a
-    Gaussian filter's approximation and up to the integration rule's error, but in hundreds of dimensions. Use it with
+    Gaussian filter's approximation and up to the quadrature's error, but in hundreds of dimensions. Use it with
     `numpyro.infer.MCMC`; `lfm_ppl.EllipticalSlice` works on it where all other sites are conditioned on.
 
     Args:
         fn: a NumPyro model with a site ``lfm.MarginalLikelihood``.
         points: number of points, or the grid; as in `lfm_ppl.LatentGrid`.
-        rule: "riemann", "trapezoid" or "linear".
+        quadrature: "riemann", "trapezoid" or "linear".
 
     Raises:
         ValueError: what `lfm_ppl.LatentGrid` raises; no such site; a panel.
@@ -80,9 +80,10 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
 
     supports_all_likelihoods = False
 
-    def __init__(self, fn: Callable[..., Any] | None = None, points: ArrayLike = 363, rule: str = "linear") -> None:
-        checks.one_of("rule", rule, RULES)
-        self.points, self.rule = points, rule
+    def __init__(self, fn: Callable[..., Any] | None = None, points: ArrayLike = 363,
+                 quadrature: str = "linear") -> None:
+        checks.one_of("quadrature", quadrature, QUADRATURES)
+        self.points, self.quadrature = points, quadrature
         super().__init__(fn)
 
     def missing(self) -> str:
@@ -101,7 +102,7 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         if site["is_observed"] and np.shape(site["value"]) != likelihood.event_shape:
             raise ValueError(f"the observations of {name!r} must have shape (T, D) = {likelihood.event_shape}, "
                              f"got {np.shape(site['value'])}.")
-        latent = LatentGrid(likelihood.model, likelihood.times, self.points, self.rule)
+        latent = LatentGrid(likelihood.model, likelihood.times, self.points, self.quadrature)
         shape = latent.mean.shape
         u = latent.force(numpyro.sample(f"{name}_white", dist.Normal().expand(shape).to_event(2)))
         numpyro.deterministic(f"{name}_forces", u)

@@ -1,7 +1,7 @@
 """Log probabilities of counts that stay accurate where the counts are large.
 
 Terms such as y log m, m and log y! are as large as y log y, and their sum is of order one: of counts from 1e7 on, their
-rounding errors exceed the tolerance of the sites. A family therefore computes
+rounding errors exceed the tolerance of the factors. A family therefore computes
 
 1. the log probability where the mean m is the count y, from the error e(y) of Stirling's formula,
 

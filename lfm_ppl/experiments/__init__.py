@@ -1,1 +1,0 @@
-"""Published experiments as code: tasks with seeds, stored one by one, and the tables and figures made of them."""
