@@ -283,7 +283,7 @@ def finished_result(folder: str | Path, record: Mapping[str, Any]) -> Any:
     if not is_finished(folder):
         return None
     result = arviz_data.load(path)
-    run = arviz_data.attributes(result).get("run")
+    run = result.attrs.get("run")
     if not isinstance(run, Mapping):
         raise ValueError(f"{path} has no record of its run, which cannot be resumed. Start a new run in another "
                          "folder.")

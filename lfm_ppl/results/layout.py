@@ -23,8 +23,9 @@ from lfm_ppl.inference.trajectories import LOG_PRIOR
 from lfm_ppl.io.truth import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
 from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, PERIODS, REGIMES, mixture_quantiles, predictions
+from lfm_ppl.results.result_view import ENTRY
 from lfm_ppl.results.scalars import DERIVED, units_attribute
-from lfm_ppl.results.series import ENTRY, SERIES, plate_dimension, time_coordinate, times_of
+from lfm_ppl.results.series import SERIES, plate_dimension, time_coordinate, times_of
 from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:

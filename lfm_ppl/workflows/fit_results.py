@@ -38,6 +38,7 @@ from lfm_ppl.results.files import POSTERIOR
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, TrajectoryDraws, force_periods, lay_out
 from lfm_ppl.results.predictions import SHOWN_PERIODS, repeats_often
+from lfm_ppl.results.result_view import LIKELIHOODS
 from lfm_ppl.results.sites import merge_sites
 from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
@@ -327,7 +328,7 @@ def lay_out_sites(bound: BoundModel, sites: Mapping[str, SiteProblem], values: d
     if bound.is_by_site:
         settings = {name: {key: value for key, value in site.description.items() if value is not None}
                     for name, site in sites.items()}
-        return merge_sites(groups), attributes | {arviz_data.LIKELIHOODS: json.dumps(settings)}
+        return merge_sites(groups), attributes | {LIKELIHOODS: json.dumps(settings)}
     (single,) = groups.values()
     return single, attributes
 
