@@ -178,7 +178,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
     is_observed = np.isfinite(y)
     entries = entry_coordinates(data, is_observed)
     groups = {
-        # Between sites, outputs differ: a parameter with an entry for each output of one site may belong to another.
+        # Sites differ in their outputs, and the dimension "output" of a parameter does not say whose they are.
         "posterior": _posterior(draws, coords, {**named, OUTPUT: []} if bound.is_by_site else named, labels),
         "sample_stats": xr.Dataset({k: (("chain", "draw"), v) for k, v in stats.items()}, coords),
         "data": data,
@@ -310,13 +310,9 @@ def _posterior(draws: dict, coords: dict, named: Mapping[str, list], labels: Lab
         shape = value.shape[2:]
         site_dims = labels.dims.get(label, (None,) * len(shape))
         site_dims = site_dims if len(site_dims) == len(shape) else (None,) * len(shape)
-        if site_dims == (None,) and shape[0] == len(named[OUTPUT]) > 1:
-            site_dims = (OUTPUT,)
         dims = [name or f"{label}_dim_{axis}" for axis, name in enumerate(site_dims)]
         for name, size in zip(dims, shape, strict=True):
             ticks = labels.coords.get(name, named.get(name, ()))
-            if not len(ticks) and site_dims == (name,) and size > 1:
-                ticks = named[OUTPUT]  # of a plate with an entry for each output
             extra[name] = list(ticks) if len(ticks) == size else np.arange(size)
         variables[label] = (("chain", "draw", *dims), value, {DERIVED: 1} if label in labels.derived else {})
     return xr.Dataset(variables, {**coords, **extra})

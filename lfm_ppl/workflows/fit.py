@@ -165,7 +165,8 @@ def fit(
         overwrite: replace a result or an unfinished run in ``checkpoint``.
         attributes: further attributes of the result.
         dims: parameter -> names of its dimensions, ``{"decay": ["gene"]}``. By default the plates around it,
-            ``event_dims`` of NumPyro's ``infer``, and "output" for a vector with one entry for each output.
+            ``event_dims`` of NumPyro's ``infer``. A parameter with an entry for each output has the dimension "output",
+            ``numpyro.sample("decay", prior, infer={"event_dims": ["output"]})``, and the outputs as its labels.
         coords: dimension -> labels, ``{"gene": ["CDKN1A", "SESN1"]}``, also of the dimension "output" (columns of y)
             and of the plate of a panel, whose name is the dimension of the series. By default the column names of a
             data frame are the labels of "output", and series have the labels of an xarray DataArray, or numbers. With
