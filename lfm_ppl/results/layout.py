@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -322,7 +323,8 @@ def _true_functions(bound: BoundModel, truth: Mapping[str, Any],
                     draws: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return outputs (K, D), noise-free, and deterministics (K, Q) along the true path, where all of it is known.
 
-    The dictionary is empty if the model raises an error for the truth, or fixes a parameter at another value.
+    The dictionary is empty if the model fixes a parameter at another value. So it is if the model raises an error for
+    the truth, of which a warning tells.
     """
     parameters, forces = truth.get("parameters") or {}, truth.get("forces") or {}
     model = bound.site.example.ssm.model
@@ -336,19 +338,18 @@ def _true_functions(bound: BoundModel, truth: Mapping[str, Any],
         return {}
     if any(_is_fixed_elsewhere(draws[name], parameters[name]) for name in set(parameters) & set(draws)):
         return {}
+    values = {name: np.broadcast_to(np.asarray(parameters[name], float), draws[name].shape[2:]) for name in bound.sites}
+    w = jnp.asarray(np.column_stack(parts))
     try:
-        values = {name: np.broadcast_to(np.asarray(parameters[name], float), draws[name].shape[2:])
-                  for name in bound.sites}
         ssm = bound.likelihood(values).ssm
-        w = jnp.asarray(np.column_stack(parts))
-        series = {OUTPUT: np.asarray(jax.vmap(lambda inputs, t: expected_observation(ssm, inputs, t))(w, times))}
-    except Exception:
+        series = {OUTPUT: np.asarray(jax.vmap(functools.partial(expected_observation, ssm))(w, jnp.asarray(times)))}
+        if model.deterministic_names:
+            series["deterministic"] = np.asarray(jax.vmap(ssm.deterministics)(w, times))
+    except Exception as error:  # of user code; the draws are worth having without it
+        checks.warn("the true outputs are left out of the figures: at the true parameters the model raises "
+                    f"{type(error).__name__}: {error}")
         return {}
-    try:
-        more = {"deterministic": np.asarray(jax.vmap(ssm.deterministics)(w, times))}
-    except Exception:
-        return series
-    return series | (more if model.deterministic_names else {})
+    return series
 
 
 def _is_fixed_elsewhere(draws: np.ndarray, truth: Any) -> bool:

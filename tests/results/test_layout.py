@@ -1,5 +1,6 @@
 """The layout of the groups of a result: dimensions of the parameters, and the true outputs."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
@@ -11,6 +12,7 @@ from lfm_ppl.results.layout import Labels, TrajectoryDraws, lay_out
 
 TIMES = np.arange(3.0)
 NAMES = ("a", "b")
+TRUTH = {"times": TIMES, "state": np.ones((3, 2)), "forces": {"u": np.zeros(3)}, "parameters": {"rate": [1.0, 2.0]}}
 
 
 def two_outputs(rate):
@@ -44,3 +46,17 @@ def laid_out(infer=None, plate=None, build=two_outputs, truth=None):
 def test_only_a_parameter_that_says_so_is_of_the_outputs(keywords, dimension, labels):
     rate = laid_out(**keywords)["posterior"]["rate"]
     assert rate.dims == ("chain", "draw", dimension) and rate[dimension].values.tolist() == labels
+
+
+def test_true_outputs_are_computed_or_a_warning_says_why_not():
+    truth = laid_out(truth=TRUTH)["truth"]
+    np.testing.assert_allclose(truth["outputs"], 2.0)
+
+    def build(rate):
+        if not isinstance(rate, jax.core.Tracer) and float(rate[1]) == 2.0:
+            raise RuntimeError("no such rate")
+        return two_outputs(rate)
+
+    with pytest.warns(UserWarning, match="true outputs are left out.*RuntimeError: no such rate"):
+        truth = laid_out(build=build, truth=TRUTH)["truth"]
+    assert "outputs" not in truth and "forces" in truth
