@@ -186,7 +186,8 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
                              progress=False, **options)
                 predicted = ResultView.of(result).group(GROUP).isel(time=future)
             except Exception as error:
-                raise type(error)(f"at the origin {times[origin]:g} (row {origin}): {error}") from error
+                error.add_note(f"at the origin {times[origin]:g} (row {origin})")
+                raise
             draws_of_y = flat_draws(observed_variable(predicted))
             # An observation family has no normal distribution at each draw.
             mean, sd = (flat_draws(predicted[name]) if name in predicted else None for name in (MEAN, SD))
