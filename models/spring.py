@@ -72,10 +72,10 @@ def model(times, y=None, units=None) -> None:
         y: the two positions, shape (T, 2); NaN is missing, None draws from the prior predictive.
         units: name -> unit, for plots.
     """
-    pair = dist.LogNormal(jnp.zeros(2), 1.0).to_event(1)
-    damping = numpyro.sample("damping", pair)
-    stiffness = numpyro.sample("stiffness", pair)
-    sensitivity = numpyro.sample("sensitivity", pair)
+    pair, of_outputs = dist.LogNormal(jnp.zeros(2), 1.0).to_event(1), {"event_dims": ["output"]}
+    damping = numpyro.sample("damping", pair, infer=of_outputs)
+    stiffness = numpyro.sample("stiffness", pair, infer=of_outputs)
+    sensitivity = numpyro.sample("sensitivity", pair, infer=of_outputs)
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(0.5, 0.7))
     noise_sd = numpyro.sample("noise_sd", dist.HalfNormal(0.2))
     system = build(damping, stiffness, sensitivity, lengthscale, noise_sd, units)

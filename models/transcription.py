@@ -163,7 +163,7 @@ def model(times, y=None, outputs=None, units=None, link="softplus", gamma=0.5, d
 
     def per_gene(name, median, spread):
         prior = dist.LogNormal(jnp.log(median), spread).expand([len(outputs)]).to_event(1)
-        return numpyro.sample(name, prior)
+        return numpyro.sample(name, prior, infer={"event_dims": ["output"]})
 
     basal = per_gene("basal", 0.05 * rate, 1.0)
     sensitivity = per_gene("sensitivity", 0.5 * rate, 0.8)

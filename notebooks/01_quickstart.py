@@ -33,7 +33,7 @@ import numpyro.distributions as dist
 
 import lfm_ppl as lfm
 from lfm_ppl.results import plots, tables
-from lfm_ppl.results.arviz_data import group, summary
+from lfm_ppl.results.arviz_data import summary
 
 quick = bool(os.environ.get("LFM_QUICK"))
 size = dict(chains=2, warmup=50, samples=50) if quick else dict(chains=4, warmup=1000, samples=1000)
@@ -128,7 +128,7 @@ plots.plot_residuals(result, width="full")
 # by one or more over the posterior, they are not, and a second fit with another rule shows by how much.
 
 # %%
-at_mean = {name: float(group(result, "posterior")[name].mean()) for name in truth}
+at_mean = {name: float(result["posterior"][name].mean()) for name in truth}
 variants = {
     "Taylor": {"rule": lfm.Taylor(), "iterations": 0},
     "cubature": {"rule": lfm.Cubature(), "iterations": 0},

@@ -38,7 +38,7 @@ import pandas as pd
 import lfm_ppl as lfm
 from lfm_ppl.io import loading
 from lfm_ppl.results import plots, tables
-from lfm_ppl.results.arviz_data import convergence_warnings, group, summary
+from lfm_ppl.results.arviz_data import convergence_warnings, summary
 
 quick = bool(os.environ.get("LFM_QUICK"))
 size = dict(chains=2, warmup=50, samples=50) if quick else dict(chains=4, warmup=1000, samples=1000)
@@ -99,7 +99,7 @@ plots.plot_fit(result, width="full")
 # irradiation and falls.
 
 # %%
-trajectories = group(result, "trajectories")
+trajectories = result["trajectories"]
 force = trajectories["forces"].isel(force=0).stack(sample=("chain", "draw"))
 activity = np.asarray(jax.nn.softplus(force.transpose("at", "sample").values))
 hours = trajectories["at"].values
@@ -125,7 +125,7 @@ print(f"probability that it lies in the first half of the experiment: {early:.3f
 # %%
 def genes(one) -> pd.DataFrame:
     """Return the rates of every gene of a result, in the units of the file."""
-    posterior = group(one, "posterior")
+    posterior = one["posterior"]
     outputs = [str(gene) for gene in posterior["output"].values]
     anchor = outputs.index("CDKN1A") if "CDKN1A" in outputs else 0
     draws = {name: posterior[name].values.reshape(-1, len(outputs)) for name in ("basal", "sensitivity", "decay")}
@@ -206,7 +206,7 @@ plt.show()
 response, gamma = transcription.definitions["activity"], transcription.options["gamma"][0]
 figure, panels = plt.subplots(1, 4, figsize=(7.0, 2.2), layout="constrained")
 for axes, colour, (link, one) in zip(panels, colours, results.items(), strict=True):
-    trajectories = group(one, "trajectories")
+    trajectories = one["trajectories"]
     force = trajectories["forces"].isel(force=0).stack(sample=("chain", "draw"))
     activity = np.asarray(response(jax.numpy.asarray(force.transpose("at", "sample").values), link, gamma))
     low, middle, high = np.quantile(activity, [0.025, 0.5, 0.975], axis=1)

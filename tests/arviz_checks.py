@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.results.arviz_data import group
+from lfm_ppl.results.result_view import ResultView
 
 IS_DATATREE = int(az.__version__.split(".")[0]) >= 1
 
@@ -22,11 +22,11 @@ def check_arviz(result, counts):
     Returns:
         Name of a variable -> pointwise expected log predictive densities, by entry.
     """
-    posterior, observed = group(result, "posterior"), group(result, "observed_data")
+    posterior, observed = ResultView.of(result).posterior, ResultView.of(result).group("observed_data")
     for name in ("posterior_predictive", "log_likelihood"):
-        xr.testing.assert_equal(group(result, name)["draw"], posterior["draw"])
-        xr.testing.assert_equal(group(result, name)["chain"], posterior["chain"])
-        assert {label: variable.shape[2:] for label, variable in group(result, name).items()} == {
+        xr.testing.assert_equal(ResultView.of(result).group(name)["draw"], posterior["draw"])
+        xr.testing.assert_equal(ResultView.of(result).group(name)["chain"], posterior["chain"])
+        assert {label: variable.shape[2:] for label, variable in ResultView.of(result).group(name).items()} == {
             label: variable.shape for label, variable in observed.items()}
     pointwise = {}
     with warnings.catch_warnings():

@@ -15,8 +15,8 @@ import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.io.data import write_csv
 from lfm_ppl.results import arviz_data, rebuilding
-from lfm_ppl.results.inputs import FORECAST, inputs_of
 from lfm_ppl.results.plots import plot_fit
+from lfm_ppl.results.result_view import ResultView
 
 HOUSE = """date,indoor,heater,outside
 2026-01-05 06:00,18.0,0,5
@@ -71,10 +71,10 @@ def test_the_command_line_maps_columns_to_the_model_s_names_and_unit(tmp_path, m
     assert main(["fit", "house.py", "--data", "house.csv", "--outputs", "indoor", "--inputs", "heater,outside:linear",
                  "--sampler", "map", "--samples", "10", "--out", "out", "--quiet"]) == 0
     result = lfm.load("out")
-    assert {name: table.interpolation for name, table in inputs_of(result).items()} == {
+    assert {name: table.interpolation for name, table in ResultView.of(result).inputs.items()} == {
         "power": "previous", "weather": "linear"}
-    assert inputs_of(result)["power"].values.tolist() == [0.0, 2.0, 2.0, 0.0]
-    observed = arviz_data.group(result, "data")
+    assert ResultView.of(result).inputs["power"].values.tolist() == [0.0, 2.0, 2.0, 0.0]
+    observed = ResultView.of(result).group("data")
     np.testing.assert_allclose(observed["time"], [6.0, 6.5, 7.0, 8.0], rtol=1e-15)
     assert observed["output"].values.tolist() == ["T"]
     room = pathlib.Path(__file__).parent.parent / "docs" / "examples" / "room.py"
@@ -136,10 +136,10 @@ def test_a_fit_takes_a_table_and_its_result_remembers_inputs_and_dates(tmp_path)
     data = lfm.read_table(frame, inputs={"outside": "linear"})
     result = lfm.fit(heated, data, sampler="map", samples=10, trajectory_draws=5, progress=False)
     again = arviz_data.load(arviz_data.save(result, tmp_path / "posterior.nc"))
-    np.testing.assert_array_equal(inputs_of(again)["outside"].values, data.inputs["outside"].values)
-    assert inputs_of(again)["outside"].interpolation == "linear"
-    assert arviz_data.attributes(again)["time_origin"] == "2026-01-05T00:00:00"
-    assert arviz_data.group(again, "data")["time"].attrs["units"] == "h"
+    np.testing.assert_array_equal(ResultView.of(again).inputs["outside"].values, data.inputs["outside"].values)
+    assert ResultView.of(again).inputs["outside"].interpolation == "linear"
+    assert ResultView.of(again).attrs["time_origin"] == "2026-01-05T00:00:00"
+    assert ResultView.of(again).group("data")["time"].attrs["units"] == "h"
     # The model is bound again with the inputs that the result holds, and gives the densities that it records.
     whole = rebuilding.problem(again, heated)
     assert np.isfinite(whole.bound.log_density(np.zeros(whole.bound.size)))
@@ -148,4 +148,4 @@ def test_a_fit_takes_a_table_and_its_result_remembers_inputs_and_dates(tmp_path)
     longer = lfm.Input(np.arange(12.0), 5.0 + 0.4 * np.arange(12.0), "linear")
     with pytest.warns(UserWarning, match="2026-01-05T13:00"):
         ahead = lfm.forecast(again, heated, [8.0, 13.0], inputs={"outside": longer}, progress=False)
-    np.testing.assert_array_equal(inputs_of(ahead, FORECAST)["outside"].values, longer.values)
+    np.testing.assert_array_equal(ResultView.of(ahead).forecast_inputs["outside"].values, longer.values)

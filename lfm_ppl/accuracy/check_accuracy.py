@@ -33,8 +33,9 @@ from lfm_ppl.inference.trajectories import evenly_spaced
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.results import arviz_data, rebuilding
-from lfm_ppl.results.scalars import choose, scalar_draws
-from lfm_ppl.results.sites import select_site
+from lfm_ppl.results.result_view import ResultView
+from lfm_ppl.results.scalars import choose
+from lfm_ppl.results.sites import site_view
 from lfm_ppl.storage import checkpoint as checkpoints
 from lfm_ppl.storage import run_record
 from lfm_ppl.utils import checks
@@ -112,8 +113,9 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
     checks.positive_integer("replicates", replicates)
     if replicates < 2:
         raise ValueError("replicates must be at least 2: their spread estimates the noise of the particle filter.")
-    _check_sampler(result)
-    full_problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs)
+    view = ResultView.of(result)
+    _check_sampler(str(view.attrs.get("sampler", "")))
+    full_problem = rebuilding.problem(view, numpyro_model, times, y, model_kwargs)
     examples = {name: site.example for name, site in full_problem.sites.items()}
     for example in examples.values():
         if example.constraints_in_words:
@@ -123,7 +125,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
             raise ValueError("a check of the Gaussian filter's accuracy does not support a model that switches between "
                              "regimes; compare its likelihood with lfm.rao_blackwellised.")
     kinds = {name: _kind(reference, example.ssm) for name, example in examples.items()}
-    posterior = arviz_data.group(result, "posterior")
+    posterior = view.posterior
     draw_index, rows = evenly_spaced(posterior.sizes["chain"], posterior.sizes["draw"], draws)
     run = None
     if checkpoint is not None:
@@ -138,21 +140,20 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         problem = replace(full_problem.select(rows), stores=None if run is None else run.batches)
         settings = {name: ReferenceSettings(kind, particles, replicates, steps, seed, progress)
                     for name, kind in kinds.items()}
-        report = _report(result, problem, draw_index, settings)
+        report = _report(view, problem, draw_index, settings)
     arviz_data.add_group(result, GROUP, report.to_dataset())
     return report
 
 
-def _report(result: Any, problem: LikelihoodProblem, draw_index: np.ndarray,
+def _report(view: ResultView, problem: LikelihoodProblem, draw_index: np.ndarray,
             settings: Mapping[str, ReferenceSettings]) -> AccuracyReport:
-    posterior = arviz_data.group(result, "posterior")
-    shape = (posterior.sizes["chain"], len(draw_index))
+    shape = (view.posterior.sizes["chain"], len(draw_index))
     sites = problem.sites
     filtered = {name: log_likelihoods.gaussian(site).reshape(shape) for name, site in sites.items()}
     for name, site in sites.items():
-        site_result = select_site(result, name) if arviz_data.sites_of(result) else result
+        result = site_view(view, name) if view.likelihood_sites else view
         recorded = log_likelihoods.recorded(site, filtered[name].ravel()).reshape(shape)
-        rebuilding.check_likelihood(site_result, recorded, draw_index)
+        rebuilding.check_likelihood(result, recorded, draw_index)
     doubled = [log_likelihoods.gaussian(site, "log likelihoods with finer steps",
                                         **log_likelihoods.finer_steps(site.example)) for site in sites.values()]
     iterated, refinements = dict(filtered), {name: more_iterations(site.example) for name, site in sites.items()}
@@ -161,7 +162,7 @@ def _report(result: Any, problem: LikelihoodProblem, draw_index: np.ndarray,
             iterated[name] = log_likelihoods.gaussian(sites[name], "log likelihoods with more iterations",
                                                   **refinement.settings).reshape(shape)
     references = {name: _reference(site, filtered[name], settings[name], len(sites)) for name, site in sites.items()}
-    return _assess(result, draw_index, np.sum([*filtered.values()], axis=0), np.sum(doubled, axis=0).reshape(shape),
+    return _assess(view, draw_index, np.sum([*filtered.values()], axis=0), np.sum(doubled, axis=0).reshape(shape),
                    _of_all_sites(references), problem,
                    np.sum([*iterated.values()], axis=0) if any(refinements.values()) else None)
 
@@ -179,24 +180,23 @@ def _of_all_sites(references: Mapping[str, Reference]) -> Reference:
         max(reference.particles for reference in values), any(reference.limited for reference in values))
 
 
-def _assess(result: Any, draw_index: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
+def _assess(view: ResultView, draw_index: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
             problem: LikelihoodProblem, iterated: np.ndarray | None) -> AccuracyReport:
     """Return the report from log likelihoods (C, S) at draws ``draw_index`` (S,) of each chain.
 
     ``filtered`` is of the Gaussian filter, ``doubled`` of twice as many steps, ``iterated`` of more iterations.
     """
-    posterior = arviz_data.group(result, "posterior")
+    posterior = view.posterior
     averaged = _summed(reference.estimates.reshape(*filtered.shape, *reference.estimates.shape[1:]))
     ratio = averaged.log_mean - filtered
     efficiency = _relative_efficiency(filtered)
     weights = importance_weights.smooth(ratio, efficiency)
-    all_draws = scalar_draws(posterior)
-    varying = {label: all_draws[label] for label in choose(all_draws, None)}
+    varying = {label: view.draws[label] for label in choose(view.draws, None)}
     table = importance_weights.corrected_moments(varying, draw_index, weights.log_weight)
     noisy = reference.estimates.shape[-1] > 1
     noise_sd = noise(averaged) if noisy else 0.0
     change = doubled - filtered
-    example, attrs = problem.example, arviz_data.attributes(result)
+    example, attrs = problem.example, view.attrs
     findings = Findings(
         table=table, k=weights.k, threshold=weights.threshold, exact=reference.description.startswith(EXACT),
         step_change_sd=float(change.std()), noise_sd=noise_sd, noise_share=_share(noise_sd, ratio),
@@ -267,8 +267,7 @@ def _relative_efficiency(log_likelihood: np.ndarray) -> float:
     return float(np.clip(log_likelihood.var(ddof=1) / error**2 / log_likelihood.size, 0.01, 1.0))
 
 
-def _check_sampler(result: Any) -> None:
-    sampler = str(arviz_data.attributes(result).get("sampler", ""))
+def _check_sampler(sampler: str) -> None:
     if sampler not in ("", *GAUSSIAN_FILTER_SAMPLERS):
         exact = sampler in SAMPLERS or "+" in sampler  # after a "+": how the draws were corrected
         which = ", which samples the exact posterior already" if exact else ""

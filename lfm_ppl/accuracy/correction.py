@@ -15,6 +15,7 @@ from lfm_ppl.accuracy.report import AccuracyReport
 from lfm_ppl.inference.trajectories import evenly_spaced, trajectories
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.layout import with_summaries
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.series import TIMES, times_of
 from lfm_ppl.utils import checks
 
@@ -52,28 +53,27 @@ def correct_posterior(result: Any, numpyro_model: Callable, times: Any = None, y
     """
     if trajectory_draws != 0:
         checks.positive_integer("trajectory_draws", trajectory_draws)
-    arviz_data.refuse_several_sites(result)
-    report = AccuracyReport.of(result)
+    view = ResultView.of(result)
+    view.refuse_several_sites()
+    report = AccuracyReport.of(view)
     if not report.reliable:
         raise ValueError(f"the importance weights cannot be relied on: Pareto k = {report.k:.2f}, not below "
                          f"{report.threshold:.2f}. Check at more draws, or sample the exact posterior with "
                          'lfm.fit(..., sampler="pmmh").')
-    posterior = arviz_data.group(result, "posterior").transpose("chain", "draw", ...)
+    posterior = view.posterior.transpose("chain", "draw", ...)
     chains, size = report.log_weight.shape
     draw_index = np.searchsorted(posterior["draw"].values, report.dataset["draw"].values)
     of_all = (np.arange(chains)[:, None] * posterior.sizes["draw"] + draw_index).ravel()
     picked = of_all[importance_weights.resample(report.log_weight, chains * size, seed)].reshape(chains, size)
-    groups = {name: _select_draws(arviz_data.group(result, name), picked) for name in _OF_DRAWS
-              if arviz_data.has_group(result, name)}
-    groups |= {name: arviz_data.group(result, name) for name in _KEPT if arviz_data.has_group(result, name)}
-    if trajectory_draws and arviz_data.has_group(result, "trajectories"):
-        groups["trajectories"] = _draw_trajectories(result, numpyro_model, times, y, model_kwargs, picked,
+    groups = {name: _select_draws(view.groups[name], picked) for name in _OF_DRAWS if name in view.groups}
+    groups |= {name: view.groups[name] for name in _KEPT if name in view.groups}
+    if trajectory_draws and "trajectories" in view.groups:
+        groups["trajectories"] = _draw_trajectories(view, numpyro_model, times, y, model_kwargs, picked,
                                                     trajectory_draws, seed)
-    attrs = arviz_data.attributes(result)
-    attrs |= {"sampler": f"{attrs.get('sampler', 'unknown')} + importance resampling", "chains": chains,
-              "samples": size, "reference": report.reference, "pareto_k": report.k, "effective_draws": report.ess,
-              "warnings": "[]", "created_at": datetime.now(UTC).isoformat(timespec="seconds")}
-    return arviz_data.build(groups, attrs)
+    attrs = {"sampler": f"{view.attrs.get('sampler', 'unknown')} + importance resampling", "chains": chains,
+             "samples": size, "reference": report.reference, "pareto_k": report.k, "effective_draws": report.ess,
+             "warnings": "[]", "created_at": datetime.now(UTC).isoformat(timespec="seconds")}
+    return arviz_data.build(groups, {**view.attrs, **attrs})
 
 
 def _select_draws(dataset: xr.Dataset, picked: np.ndarray) -> xr.Dataset:
@@ -84,14 +84,14 @@ def _select_draws(dataset: xr.Dataset, picked: np.ndarray) -> xr.Dataset:
         chain=np.arange(picked.shape[0]), draw=np.arange(picked.shape[1]))
 
 
-def _draw_trajectories(result: Any, numpyro_model: Callable, times: Any, y: Any,
+def _draw_trajectories(view: ResultView, numpyro_model: Callable, times: Any, y: Any,
                        model_kwargs: Mapping[str, Any] | None, picked: np.ndarray, count: int,
                        seed: int) -> xr.Dataset:
-    """Draw trajectories at some of the picked draws, in the layout of ``result``."""
-    template = arviz_data.group(result, "trajectories")
+    """Draw trajectories at some of the picked draws, in the layout of the result."""
+    template = view.group("trajectories")
     path_times = times_of(template, "at").values if {"at", TIMES} & set(template.coords) else None
     draw_index, rows = evenly_spaced(picked.shape[0], picked.shape[1], count)
-    problem = rebuilding.problem(result, numpyro_model, times, y, model_kwargs).select(picked.ravel()[rows])
+    problem = rebuilding.problem(view, numpyro_model, times, y, model_kwargs).select(picked.ravel()[rows])
     paths = {label: values.reshape(picked.shape[0], len(draw_index), *values.shape[1:]) for label, values in
              trajectories(jax.random.key(seed), problem.bound, problem.draws, path_times).items()}
     variables = {}

@@ -18,7 +18,8 @@ import xarray as xr
 
 from lfm_ppl.accuracy import importance_weights
 from lfm_ppl.accuracy.verdict import Verdict
-from lfm_ppl.results import arviz_data, tables
+from lfm_ppl.results import tables
+from lfm_ppl.results.result_view import ResultView
 
 GROUP = "accuracy"
 EXACT = "none needed"
@@ -45,7 +46,7 @@ class AccuracyReport:
         Raises:
             ValueError: it holds none.
         """
-        return cls(arviz_data.group(result, GROUP))
+        return cls(ResultView.of(result).group(GROUP))
 
     def to_dataset(self) -> xr.Dataset:
         """Return the group that a result stores."""

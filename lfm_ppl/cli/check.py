@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import shlex
 import time
 import warnings
@@ -29,6 +28,7 @@ from lfm_ppl.cli.options import CheckOptions
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.inference.trajectories import evenly_spaced
 from lfm_ppl.results import arviz_data, html_report, rebuilding, tables
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.series import times_of
 from lfm_ppl.storage import checkpoint, files
 from lfm_ppl.utils import atomic_files
@@ -57,7 +57,7 @@ def run(result: str, options: CheckOptions, line: Sequence[str]) -> int:
         atomic_files.refuse_existing(path.parent / name, replace)
     html_report.refuse_foreign(path.parent / html_report.NAME, options.overwrite)
     folders.check_writable(path.parent)
-    session.start(int(arviz_data.attributes(posterior).get("chains", 1)), not options.no_cache)
+    session.start(int(posterior.attrs.get("chains", 1)), not options.no_cache)
     task = rebuild_fit(posterior, options.model, path)
     command, resume = pages.command_line(line), pages.command_line(line, "--resume")
     with contextlib.ExitStack() as stack:
@@ -86,7 +86,7 @@ def run(result: str, options: CheckOptions, line: Sequence[str]) -> int:
             print("the filter is exact: there is nothing to correct")
         elif folder is not None:
             # The report of the result again, with a link to the corrected result.
-            status = max(status, _correct(task, report, options, folder, command),
+            status = max(status, _correct(posterior, task, report, options, folder, command),
                          pages.update(arviz_data.load(path), path.parent))
             if status != INTERRUPTED:
                 method = "draws weighted by the exact likelihood" if report.reliable else "particle-marginal RAM"
@@ -103,21 +103,21 @@ def run(result: str, options: CheckOptions, line: Sequence[str]) -> int:
 def _settled_report(posterior: Any, options: CheckOptions) -> AccuracyReport | None:
     """Return the stored report if it requires new chains, so that a new check would be wasted; else None."""
     is_new_check = not options.correct or options.draws is not None or options.reference != "auto"
-    if is_new_check or not arviz_data.has_group(posterior, GROUP):
+    view = ResultView.of(posterior)
+    if is_new_check or GROUP not in view.groups:
         return None
-    report = AccuracyReport.of(posterior)
+    report = AccuracyReport.of(view)
     needs_chains = any(remedy.startswith(CORRECT) for remedy in report.verdict.remedies)
     return report if not report.reliable and needs_chains else None
 
 
 def _check_likelihood(task: StoredFit) -> None:
     """Raise ValueError if the log likelihood at a draw of each chain differs from the stored one."""
-    posterior = arviz_data.group(task.posterior, "posterior")
-    chains = posterior.sizes["chain"]
-    draw_indices, rows = evenly_spaced(chains, posterior.sizes["draw"], 1)
-    problem = rebuilding.problem(task.posterior, task.model, model_kwargs=task.keywords).select(rows)
+    sizes = task.view.posterior.sizes
+    draw_indices, rows = evenly_spaced(sizes["chain"], sizes["draw"], 1)
+    problem = rebuilding.problem(task.view, task.model, model_kwargs=task.keywords).select(rows)
     values = log_likelihoods.recorded(problem, log_likelihoods.gaussian(problem))
-    rebuilding.check_likelihood(task.posterior, values.reshape(chains, len(draw_indices)), draw_indices)
+    rebuilding.check_likelihood(task.view, values.reshape(sizes["chain"], len(draw_indices)), draw_indices)
 
 
 def _write(report: AccuracyReport, posterior: Any, path: Path, command: str) -> int:
@@ -131,19 +131,20 @@ def _write(report: AccuracyReport, posterior: Any, path: Path, command: str) -> 
     return pages.draw(plot_accuracy, posterior, path.parent / FIGURE, True) or pages.update(stored, path.parent)
 
 
-def _correct(task: StoredFit, report: AccuracyReport, options: CheckOptions, folder: Path, command: str) -> int:
+def _correct(posterior: Any, task: StoredFit, report: AccuracyReport, options: CheckOptions, folder: Path,
+             command: str) -> int:
     """Write the corrected result: by resampling where the weights are reliable, else by new chains."""
     start_time = time.perf_counter()
     if report.reliable:
         note = " (no chains are needed, and none are delayed)" if options.delayed else ""
         print(f"correct  resampling {report.log_weight.size} draws, worth {report.ess:.0f} after weighting{note}")
-        corrected = correct_posterior(task.posterior, task.model, model_kwargs=task.keywords, seed=options.seed)
+        corrected = correct_posterior(posterior, task.model, model_kwargs=task.keywords, seed=options.seed)
     else:
         corrected = _exact_chains(task, options, folder)
-    first = arviz_data.attributes(task.posterior).get("command_line")
+    first = task.view.attrs.get("command_line")
     corrected.attrs["command_line"] = "\n".join([*([first] if first else []), command])
     status = fit.report(corrected, folder, time.perf_counter() - start_time, options.overwrite or options.resume)
-    partial = arviz_data.attributes(corrected).get("partial")
+    partial = corrected.attrs.get("partial")
     if partial is None:
         return status
     print(f"partial  {partial}")
@@ -156,14 +157,14 @@ def _exact_chains(task: StoredFit, options: CheckOptions, folder: Path) -> Any:
     Where the weights fail, the filter's likelihood is too small in a part of the posterior, and delayed acceptance,
     which screens proposals with it, mixes worse than it saves; so it is left to the user.
     """
-    attrs = arviz_data.attributes(task.posterior)
+    attrs = task.view.attrs
     chains, warmup, samples = (_CHAINS, _WARMUP, _SAMPLES) if attrs.get("sampler") == "map" else (
         int(attrs[name]) for name in ("chains", "warmup", "samples"))
     if attrs.get("init") == "laplace":  # the short warm-up of NUTS is too short for a random walk
         warmup = max(warmup, _WARMUP)
     trajectory_times = None
-    if arviz_data.has_group(task.posterior, "trajectories"):
-        trajectory_times = times_of(arviz_data.group(task.posterior, "trajectories"), "at").values
+    if "trajectories" in task.view.groups:
+        trajectory_times = times_of(task.view.groups["trajectories"], "at").values
     kind = ", delayed acceptance" if options.delayed else ""
     print(f"correct  particle-marginal RAM{kind}, {chains} chains of {warmup} warm-up and {samples} kept draws",
           flush=True)
@@ -172,9 +173,9 @@ def _exact_chains(task: StoredFit, options: CheckOptions, folder: Path) -> Any:
         task.model, task.observed, sampler="pmmh", sampler_options={"delayed": options.delayed, **particles},
         chains=chains, warmup=warmup, samples=samples, seed=options.seed, at=trajectory_times,
         trajectory_draws=0 if trajectory_times is None else 400, model_kwargs=task.keywords,
-        fixed=json.loads(attrs.get("fixed") or "{}"), name=task.name, progress=not options.quiet,
+        fixed=task.view.decoded("fixed"), name=task.name, progress=not options.quiet,
         checkpoint=folder, resume=options.resume, overwrite=options.overwrite,
         attributes={name: attrs[name] for name in _RECORD if name in attrs})
-    if arviz_data.has_group(task.posterior, "truth"):
-        arviz_data.add_group(corrected, "truth", arviz_data.group(task.posterior, "truth"))
+    if "truth" in task.view.groups:
+        arviz_data.add_group(corrected, "truth", task.view.groups["truth"])
     return corrected

@@ -30,6 +30,7 @@ from lfm_ppl.io.data_set import OF_SERIES, Data, InputTable, stack_series
 from lfm_ppl.io.truth import read_truth
 from lfm_ppl.results import arviz_data, html_report, tables
 from lfm_ppl.results.fields import add_fields
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.storage import checkpoint, files
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.interruption import INTERRUPTED, interruptible
@@ -77,7 +78,7 @@ def run(name: str, options: FitArguments, line: Sequence[str]) -> int:
                 progress=not output.quiet, name=model.name, checkpoint=folder, resume=output.resume,
                 attributes=result_attributes(options, line, model, observed, model_options),
                 **sampling_arguments(options, model))
-            partial = arviz_data.attributes(posterior).get("partial")
+            partial = posterior.attrs.get("partial")
             # The report is written last: without it the run was killed while it drew its figures.
             if is_finished and partial is None and (folder / html_report.NAME).is_file():
                 print(f"\nthe run in {folder} is complete; nothing was changed")
@@ -192,16 +193,17 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
 
     # A checkpoint has written a partial or complete result under this name.
     written = [arviz_data.save(posterior, folder / files.POSTERIOR, overwrite=True)]
-    table, attrs = arviz_data.summary(posterior), arviz_data.attributes(posterior)
-    written.append(tables.write_csv(tables.annotate(table, posterior), folder / folders.SUMMARY, overwrite))
+    view = ResultView.of(posterior)
+    table, attrs = arviz_data.summary(view), view.attrs
+    written.append(tables.write_csv(tables.annotate(table, view), folder / folders.SUMMARY, overwrite))
     print(f"\n{tables.text_table(table, width=shutil.get_terminal_size().columns)}\n")
-    for message in misfit(posterior):
+    for message in misfit(view):
         print(f"note     {message}")
     figures: list[Path] = []
     status = 0
     try:
         if "partial" not in attrs:
-            figures = save_figures(posterior, folder, overwrite=overwrite)
+            figures = save_figures(view, folder, overwrite=overwrite)
     except Exception as error:  # the draws are saved
         print(f"lfm-ppl: the figures could not be drawn: {error}\n"
               f"         try again with: lfm-ppl plot {folder} --overwrite", file=sys.stderr)
@@ -215,4 +217,4 @@ def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int
     for path in (*written, *figures):
         print(f"wrote    {path}")
     return max(status, pages.report_failure(
-        lambda: html_report.save_report(posterior, folder / html_report.NAME, overwrite, figures=figures)))
+        lambda: html_report.save_report(view, folder / html_report.NAME, overwrite, figures=figures)))

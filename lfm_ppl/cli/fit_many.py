@@ -26,6 +26,7 @@ from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
 from lfm_ppl.results import arviz_data, html_report, tables
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.storage import files
 from lfm_ppl.utils.progress import duration
 from lfm_ppl.workflows.fit_tasks import file_name
@@ -87,7 +88,8 @@ def _write(fitted: Any, folder: Path, attributes: dict[str, Any]) -> None:
         return
     fitted.result.attrs.update(attributes)
     arviz_data.save(fitted.result, target / files.POSTERIOR, overwrite=True)
-    summary = tables.annotate(arviz_data.summary(fitted.result), fitted.result)
+    view = ResultView.of(fitted.result)
+    summary = tables.annotate(arviz_data.summary(view), view)
     tables.write_csv(summary, target / folders.SUMMARY, overwrite=True)
     try:
         html_report.save_report(fitted.result, target / html_report.NAME, overwrite=True, figures=[])

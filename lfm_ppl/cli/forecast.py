@@ -29,9 +29,9 @@ from lfm_ppl.io import data
 from lfm_ppl.io.data_set import Data, continued_inputs, on_clock_of_fit
 from lfm_ppl.io.dosing import ROLES
 from lfm_ppl.results import arviz_data, html_report, inputs, plots, tables
-from lfm_ppl.results.plots.trajectories import trajectory_names
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, MEAN, held_out_data, summary
-from lfm_ppl.results.series import select_series, series_dimension, series_labels
+from lfm_ppl.results.result_view import ResultView
+from lfm_ppl.results.series import series_view
 from lfm_ppl.storage import files
 from lfm_ppl.utils import atomic_files, calendar_time, checks
 
@@ -59,7 +59,7 @@ def run(result: str, options: ForecastOptions, line: Sequence[str]) -> int:
             for name in (TABLE, FIGURE, *MORE_FIGURES.values(), *([SCORES] if options.held_out else [])):
                 atomic_files.refuse_existing(folder / name, options.overwrite)
             html_report.refuse_foreign(folder / html_report.NAME, options.overwrite)
-            if not options.overwrite and arviz_data.has_group(posterior, GROUP):
+            if not options.overwrite and GROUP in ResultView.of(posterior).groups:
                 raise FileExistsError(f"{path} already holds predictions. Write to another folder with --out, or "
                                       "replace them with --overwrite.")
             folders.check_writable(folder)
@@ -67,7 +67,7 @@ def run(result: str, options: ForecastOptions, line: Sequence[str]) -> int:
         task = rebuild_fit(posterior, options.model, path)
         held_out = None if options.held_out is None else _held_out_data(options.held_out, options, task)
         forecast, scores = _forecast(options, task, held_out)
-        group = arviz_data.group(forecast, GROUP).assign_attrs(command_line=pages.command_line(line))
+        group = ResultView.of(forecast).group(GROUP).assign_attrs(command_line=pages.command_line(line))
         forecast = arviz_data.add_group(forecast, GROUP, group)
         return _write(forecast, scores, task, path, folder, options)
 
@@ -79,14 +79,15 @@ def _forecast(options: ForecastOptions, task: StoredFit, held_out: Data | None) 
     if held_out is not None:
         times = np.union1d(times, held_out.times)
         keywords["inputs"] = held_out.inputs
-    forecast = lfm_ppl.forecast(task.posterior, task.model, times, draws=options.draws, seed=options.seed,
+    forecast = lfm_ppl.forecast(task.view, task.model, times, draws=options.draws, seed=options.seed,
                                 progress=not options.quiet, **keywords)
     if held_out is None or not np.isfinite(held_out.y).any():
         return forecast, None
     # The scores of an observation family need the model.
-    is_gaussian = MEAN in arviz_data.group(forecast, GROUP)
-    scores = lfm_ppl.score(forecast, held_out, **({} if is_gaussian else {"numpyro_model": task.model, **keywords}))
-    group = held_out_data(held_out.times, held_out.y, arviz_data.group(forecast, "data"))
+    view = ResultView.of(forecast)
+    is_gaussian = MEAN in view.group(GROUP)
+    scores = lfm_ppl.score(view, held_out, **({} if is_gaussian else {"numpyro_model": task.model, **keywords}))
+    group = held_out_data(held_out.times, held_out.y, view.group("data"))
     return arviz_data.add_group(forecast, HELD_OUT, group), scores
 
 
@@ -110,7 +111,7 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
         if name not in interpolations and way not in ROLES:
             raise ValueError(checks.unknown("known input of the result", name, interpolations))
     unit = observed.units.get("time", "")
-    unit_of_fitted_file = arviz_data.attributes(task.posterior).get(TIME_UNIT)
+    unit_of_fitted_file = task.view.attrs.get(TIME_UNIT)
     read = data.read_csv(path, output_columns(options.columns, model), options.columns.time_column,
                          dict(columns.values()), options.time_unit, observed=not columns,
                          default_unit=unit_of_fitted_file or (unit if observed.origin is not None else None))
@@ -131,17 +132,17 @@ def _held_out_data(path: str, options: ForecastOptions, task: StoredFit) -> Data
 def _write(forecast: Any, scores: pd.DataFrame | None, task: StoredFit, path: Path, folder: Path,
            options: ForecastOptions) -> int:
     """Write result, tables, figures and report; return 1 if a figure or the report fails."""
-    group, updated = arviz_data.group(forecast, GROUP), forecast
+    view, updated = ResultView.of(forecast), forecast
     if not options.out:
         # Load the file again: another process may have added to it.
-        updated = arviz_data.add_group(arviz_data.load(path), GROUP, group)
+        updated = arviz_data.add_group(arviz_data.load(path), GROUP, view.group(GROUP))
         for name in (HELD_OUT, inputs.FORECAST):
             updated = arviz_data.remove_group(updated, name)
-            if arviz_data.has_group(forecast, name):
-                updated = arviz_data.add_group(updated, name, arviz_data.group(forecast, name))
+            if name in view.groups:
+                updated = arviz_data.add_group(updated, name, view.groups[name])
     target = folder / files.POSTERIOR if options.out else path
     print(f"wrote    {arviz_data.save(updated, target, options.overwrite or not options.out)} (group {GROUP})")
-    table, origin = _table(forecast), task.observed.origin
+    table, origin = _table(view), task.observed.origin
     if origin is not None:  # dates as in the data
         unit = task.observed.units["time"]
         table.index = pd.Index([calendar_time.clock(float(time), origin, unit, "T", 3) for time in table.index],
@@ -150,27 +151,25 @@ def _write(forecast: Any, scores: pd.DataFrame | None, task: StoredFit, path: Pa
     if scores is not None:
         print(f"\n{tables.text_table(scores, width=shutil.get_terminal_size().columns)}\n")
         print(f"wrote    {tables.write_csv(scores, folder / SCORES, options.overwrite, index_label='output')}")
-    statuses = {name: pages.draw(plot, forecast, folder / name, options.overwrite) for name, plot in _figures(forecast)}
+    statuses = {name: pages.draw(plot, view, folder / name, options.overwrite) for name, plot in _figures(view)}
     more = {} if scores is None else {"Scores on the held-out data": scores}
     paths = [folder / name for name, status in statuses.items() if status == 0]
     return max(*statuses.values(), pages.update(updated, folder, paths, more))
 
 
-def _table(forecast: Any) -> pd.DataFrame:
+def _table(view: ResultView) -> pd.DataFrame:
     """Return the summary of the predictions, with a column of labels where there are several series."""
-    dimension = series_dimension(forecast)
-    if dimension is None:
-        return summary(arviz_data.group(forecast, GROUP))
-    summaries = {label: summary(arviz_data.group(select_series(forecast, label), GROUP))
-                 for label in series_labels(forecast)}
-    return pd.concat(summaries, names=[dimension]).reset_index(level=0)
+    if view.series_dimension is None:
+        return summary(view.group(GROUP))
+    summaries = {label: summary(series_view(view, label).group(GROUP)) for label in view.series_labels}
+    return pd.concat(summaries, names=[view.series_dimension]).reset_index(level=0)
 
 
-def _figures(forecast: Any) -> Iterator[tuple[str, Callable]]:
+def _figures(view: ResultView) -> Iterator[tuple[str, Callable]]:
     """Yield file name and function of each figure."""
     yield FIGURE, plots.plot_fit
-    if inputs.inputs_of(forecast):
+    if view.inputs:
         yield MORE_FIGURES["inputs"], plots.plot_inputs
     for kind in ("force", "deterministic", "state"):
-        if trajectory_names(forecast, kind):
+        if view.trajectory_names(kind):
             yield MORE_FIGURES[f"{kind}s"], getattr(plots, f"plot_{kind}s")

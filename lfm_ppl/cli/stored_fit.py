@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,15 @@ import numpy as np
 from lfm_ppl.cli import choices
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
+from lfm_ppl.results.result_view import SELECTED_SERIES, SELECTED_SITE, ResultView
 from lfm_ppl.utils import checks
 
 
 @dataclass(frozen=True)
 class StoredFit:
-    """A stored result, its model with keyword arguments, its data and its model file."""
+    """What is read of a stored result, its model with keyword arguments, its data and its model file."""
 
-    posterior: Any
+    view: ResultView
     name: str
     model: Callable
     keywords: dict[str, Any]
@@ -32,14 +33,13 @@ class StoredFit:
 def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit:
     """Rebuild the model from what the result in a file remembers of it."""
     from lfm_ppl.likelihoods.handlers.approximate import approximate
-    from lfm_ppl.results import arviz_data, rebuilding
-    from lfm_ppl.results.inputs import ORIGIN, inputs_of
+    from lfm_ppl.results import rebuilding
     from lfm_ppl.results.scalars import unit_of
-    from lfm_ppl.results.series import TIMES, is_selected_series, panel_of, series_dimension, series_labels, times_of
-    from lfm_ppl.results.sites import is_selected_site
+    from lfm_ppl.results.series import TIMES, panel_of, times_of
 
-    arviz_data.refuse_several_sites(posterior)
-    attrs = arviz_data.attributes(posterior)
+    view = ResultView.of(posterior)
+    view.refuse_several_sites()
+    attrs = view.attrs
     model_path = model_file or attrs.get("model_file")
     if not model_path:
         raise ValueError(f"{path} does not say which file its model {attrs.get('model', '')!r} comes from, as of one "
@@ -51,10 +51,10 @@ def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit
         remedy = "" if model_file else " The result was made with this file; if it has moved, name it with --model."
         raise ValueError(f"{error}{remedy}") from error
     try:
-        times, y = rebuilding.observations(posterior)
+        times, y = rebuilding.observations(view)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    group = arviz_data.group(posterior, "data")
+    group = view.group("data")
     outputs = tuple(str(name) for name in group["output"].values)
     if model.outputs is not None and model.outputs != outputs:
         raise ValueError(f"{path} is of the outputs {', '.join(outputs)}; {model.path} has "
@@ -63,9 +63,8 @@ def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit
     units = {name: unit for name in outputs if (unit := unit_of(variable, name))}
     if clock := unit_of(times_of(group)):
         units["time"] = clock
-    labels = [] if series_dimension(posterior) is None else series_labels(posterior)
     observed = Data(np.broadcast_to(times, y.shape[:-1]), y, outputs, units={**model.units, **units},
-                    inputs=inputs_of(posterior), origin=attrs.get(ORIGIN), series=tuple(map(str, labels)))
+                    inputs=view.inputs, origin=view.clock[0], series=tuple(map(str, view.series_labels)))
     options = _json_attribute(attrs, "options", path)
     unknown = sorted(set(options) - set(model.options))
     if unknown:
@@ -77,14 +76,14 @@ def rebuild_fit(posterior: Any, model_file: str | None, path: Path) -> StoredFit
     settings["rule"] = choices.rule(settings.get("rule"))
     numpyro_model = approximate(model.model, **settings)
     # The model of a panel gets the known inputs of all series.
-    tables = inputs_of(panel_of(posterior)[0]) if is_selected_series(posterior) else observed.inputs
+    tables = panel_of(view)[0].inputs if SELECTED_SERIES in attrs else observed.inputs
     keywords = model.keywords(replace(observed, inputs=tables), options)
-    if is_selected_site(posterior):  # the result has them by site
+    if SELECTED_SITE in attrs:  # the result has them by site
         keywords = {name: value for name, value in keywords.items() if name not in ("inputs", "events")}
-    return StoredFit(posterior, model.name, numpyro_model, keywords, observed, model)
+    return StoredFit(view, model.name, numpyro_model, keywords, observed, model)
 
 
-def _json_attribute(attrs: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
+def _json_attribute(attrs: Mapping[str, Any], name: str, path: Path) -> dict[str, Any]:
     """Return a mapping that an attribute of a result holds as JSON."""
     with contextlib.suppress(ValueError):
         if isinstance(value := json.loads(attrs.get(name) or "{}"), dict):

@@ -11,6 +11,7 @@ import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.draw_batches import DrawFunction, map_draws
+from lfm_ppl.inference.trajectories import evenly_spaced
 from lfm_ppl.likelihoods.constrained_likelihood import ConstrainedLikelihood
 
 POINTS = 100
@@ -111,6 +112,5 @@ def path_ess(bound: BoundModel, values: Mapping[str, Any]) -> PathESS | None:
 
 def _evenly_spaced(values: Mapping[str, Any], limit: int) -> dict[str, np.ndarray]:
     """Return at most ``limit`` draws."""
-    count = len(next(iter(values.values())))
-    index = np.unique(np.linspace(0, count - 1, min(limit, count)).round().astype(int))
-    return {name: np.asarray(value)[index] for name, value in values.items()}
+    _, rows = evenly_spaced(1, len(next(iter(values.values()))), limit)
+    return {name: np.asarray(value)[rows] for name, value in values.items()}

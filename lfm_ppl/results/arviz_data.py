@@ -1,7 +1,7 @@
 """The result of a fit as an ArviZ object, on ArviZ 0.23 and on ArviZ 1.x.
 
-1. ArviZ 0.23 keeps groups in an ``InferenceData``, ArviZ 1.x in an ``xarray.DataTree``. Only this module depends on
-   the difference: other modules get and set groups, xarray datasets, by name.
+1. ArviZ 0.23 keeps groups in an ``InferenceData``, ArviZ 1.x in an ``xarray.DataTree``. Only this module, which makes
+   and changes results, and `lfm_ppl.results.result_view`, which reads them, depend on the difference.
 2. `save` and `load` write and read netCDF files, atomically.
 3. `summary` tabulates the scalar parameters; `convergence_warnings` checks the chains.
 """
@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,6 +20,7 @@ import pandas as pd
 import xarray as xr
 
 from lfm_ppl.results import convergence, netcdf
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.scalars import scalar_draws, scalar_truth
 from lfm_ppl.storage import files
 
@@ -38,26 +38,8 @@ MODE = "mode"
 DEGENERATE = "degenerate_mode"
 """Attribute of a result of sampler "map": parameter -> entries at whose mode the density has a spike, as JSON."""
 
-LIKELIHOODS = "likelihood_sites"
-"""Attribute of a result with several likelihood sites: name -> its attributes that differ between sites, as JSON."""
-
 _SMALLEST_TAIL = 5
 """Fewest importance ratios that a Pareto distribution can be fitted to."""
-
-_HOW_TO_GET = {
-    "posterior": "lfm.fit",
-    "sample_stats": "lfm.fit",
-    "log_likelihood": "lfm.fit",
-    "log_prior": "lfm.fit",
-    "one_step_ahead": "lfm.fit",
-    "posterior_predictive": "lfm.fit",
-    "trajectories": "lfm.fit with trajectory_draws above zero",
-    "predictions": "lfm.forecast(result, model, times), or lfm.fit with `at`",
-    "data": "lfm.fit",
-    "observed_data": "lfm.fit",
-    "accuracy": "lfm.check_accuracy, or `lfm-ppl check`",
-    "truth": "lfm.fit on data that were simulated and carry their truth (lfm.Data.truth)",
-}
 
 
 def build(groups: Mapping[str, xr.Dataset], attrs: Mapping[str, Any] | None = None) -> Any:
@@ -77,8 +59,8 @@ def build(groups: Mapping[str, xr.Dataset], attrs: Mapping[str, Any] | None = No
     Example:
         >>> draws = xr.Dataset({"decay": (("chain", "draw"), np.ones((4, 100)))})
         >>> result = build({"posterior": draws}, {"seed": 0})
-        >>> groups(result)
-        ('posterior',)
+        >>> list(ResultView.of(result).groups)
+        ['posterior']
     """
     checked_groups = {name: _checked(name, dataset) for name, dataset in groups.items()}
     checked_groups = {name: dataset for name, dataset in checked_groups.items() if dataset.data_vars}
@@ -88,35 +70,6 @@ def build(groups: Mapping[str, xr.Dataset], attrs: Mapping[str, Any] | None = No
     tree = xr.DataTree.from_dict({f"/{name}": dataset for name, dataset in checked_groups.items()})
     tree.attrs = attrs
     return tree
-
-
-def groups(result: Any) -> tuple[str, ...]:
-    """Return the names of the groups of ``result``."""
-    if isinstance(result, xr.DataTree):
-        return tuple(str(name) for name in result.children)
-    if hasattr(result, "groups") and callable(result.groups):
-        return tuple(result.groups())
-    raise TypeError(f"result must be what lfm.fit or lfm.load returned, got {type(result).__name__}.")
-
-
-def has_group(result: Any, name: str) -> bool:
-    """Return whether ``result`` holds a group called ``name``."""
-    return name in groups(result)
-
-
-def group(result: Any, name: str) -> xr.Dataset:
-    """Return a group of ``result`` as a dataset.
-
-    Raises:
-        ValueError: there is no such group; the message says how to get it.
-    """
-    if not has_group(result, name):
-        if any(f"{name}_{site.replace('/', '.')}" in groups(result) for site in sites_of(result)):
-            refuse_several_sites(result)
-        remedy = f" {name!r} comes from {_HOW_TO_GET[name]}." if name in _HOW_TO_GET else ""
-        raise ValueError(f"the result has no group {name!r}; it has {', '.join(groups(result)) or 'none'}.{remedy}")
-    dataset = result[name]
-    return dataset.to_dataset() if isinstance(dataset, xr.DataTree) else dataset
 
 
 def add_group(result: Any, name: str, dataset: xr.Dataset) -> Any:
@@ -134,31 +87,9 @@ def add_group(result: Any, name: str, dataset: xr.Dataset) -> Any:
 
 def remove_group(result: Any, name: str) -> Any:
     """Take the group ``name`` out of ``result``, which is changed in place, if it is there; return ``result``."""
-    if has_group(result, name):
+    if name in ResultView.of(result).groups:
         del result[name]
     return result
-
-
-def attributes(result: Any) -> dict[str, Any]:
-    """Return the attributes of ``result`` as a whole: model, rule, seed, versions...
-
-    Raises:
-        TypeError: ``result`` is no ArviZ object.
-    """
-    groups(result)  # which says what it is instead
-    return dict(result.attrs)
-
-
-def sites_of(result: Any) -> dict[str, dict[str, Any]]:
-    """Return the likelihood sites of ``result`` with their attributes; none where times and data were not by site."""
-    return json.loads(str(attributes(result).get(LIKELIHOODS, "{}")))
-
-
-def refuse_several_sites(result: Any) -> None:
-    """Raise ValueError for a result with several likelihood sites, of which one has to be selected."""
-    if names := list(sites_of(result)):
-        raise ValueError(f"the result has the likelihood sites {', '.join(names)}, and this takes one; select it: "
-                         f"lfm.select_site(result, {names[0]!r}).")
 
 
 def save(result: Any, path: str | Path, overwrite: bool = False) -> Path:
@@ -183,12 +114,11 @@ def save(result: Any, path: str | Path, overwrite: bool = False) -> Path:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     written = lfm.save(result, Path(folder) / "run" / "posterior.nc")
         ...     again = lfm.load(written.parent)
-        >>> groups(again), type(again) is type(result)
-        (('posterior',), True)
+        >>> list(ResultView.of(again).groups), type(again) is type(result)
+        (['posterior'], True)
     """
-    datasets = {name: group(result, name) for name in groups(result)}
-    attrs = {"inference_library": LIBRARY, **attributes(result)}
-    return netcdf.write(datasets, attrs, path, overwrite)
+    view = ResultView.of(result)
+    return netcdf.write(view.groups, {"inference_library": LIBRARY, **view.attrs}, path, overwrite)
 
 
 def load(path: str | Path) -> Any:
@@ -246,7 +176,8 @@ def summary(result: Any) -> pd.DataFrame:
 
     Source: Vehtari et al. (2021), Bayesian Analysis 16(2), eq. 3 and section 4.1.
     """
-    draws = scalar_draws(group(result, "posterior"))
+    view = ResultView.of(result)
+    draws = view.draws
     with np.errstate(invalid="ignore"):  # of draws that are not finite
         quantiles = {label: np.quantile(values, (0.025, 0.975)) for label, values in draws.items()}
     moments = {
@@ -255,11 +186,11 @@ def summary(result: Any) -> pd.DataFrame:
         "q2.5": {label: low for label, (low, _) in quantiles.items()},
         "q97.5": {label: high for label, (_, high) in quantiles.items()},
     }
-    if has_group(result, "truth") and (truth := scalar_truth(group(result, "posterior"), group(result, "truth"))):
-        moments["truth"] = truth
-    if of_mode(result):
-        table = pd.DataFrame({**_mode(result), **moments}, index=list(draws), dtype=float)
-        if degenerate := _degenerate(result):
+    if view.truth:
+        moments["truth"] = view.truth
+    if view.is_about_mode:
+        table = pd.DataFrame({**_mode(view), **moments}, index=list(draws), dtype=float)
+        if degenerate := _degenerate(view):
             table["warnings"] = ["degenerate mode" if label in degenerate else "" for label in table.index]
         return table
     diagnostics = {
@@ -270,19 +201,13 @@ def summary(result: Any) -> pd.DataFrame:
         "r_hat": _diagnostic(draws, load_arviz().rhat, min_chains=2),
     }
     table = pd.DataFrame({**moments, **diagnostics}, index=list(draws), dtype=float)
-    if (resampled := attributes(result).get("effective_draws")) is not None:
+    if (resampled := view.attrs.get("effective_draws")) is not None:
         table["mcse_mean"] = table["sd"] / np.sqrt(resampled)
         table["ess_bulk"] = float(resampled)
         table[["ess_tail", "r_hat"]] = np.nan
-    if (partial := attributes(result).get("partial")) is not None:
+    if (partial := view.attrs.get("partial")) is not None:
         table["partial"] = str(partial).split(",", 1)[0]
     return table
-
-
-def of_mode(result: Any) -> bool:
-    """Return whether the draws of ``result`` are independent ones of a Laplace approximation, not of chains."""
-    attrs = attributes(result)
-    return attrs.get("sampler") == "map" and "effective_draws" not in attrs
 
 
 def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list[str]:
@@ -300,22 +225,20 @@ def convergence_warnings(result: Any, table: pd.DataFrame | None = None) -> list
     Returns:
         Messages that name the parameters, their values, and what to do; empty if all is well.
     """
-    attrs = attributes(result)
-    from_mode = attrs.get("sampler") == "map"
-    of_factors = convergence.of_factors(*json.loads(attrs.get(FACTORS, "[0, 0, 0]")),
-                                        constrained="constraints" in attrs, from_mode=from_mode)
-    of_factors += convergence.of_weights(*json.loads(attrs.get(WEIGHTS, "[0, 0, 0]")))
-    if of_mode(result):
-        rows = summary(result) if table is None else table
-        degenerate = [label for label in _degenerate(result) if label in rows.index]
+    view = ResultView.of(result)
+    from_mode = view.attrs.get("sampler") == "map"
+    of_factors = convergence.of_factors(*(view.decoded(FACTORS) or (0, 0, 0)), constrained="constraints" in view.attrs,
+                                    from_mode=from_mode)
+    of_factors += convergence.of_weights(*(view.decoded(WEIGHTS) or (0, 0, 0)))
+    if view.is_about_mode:
+        rows = summary(view) if table is None else table
+        degenerate = [label for label in _degenerate(view) if label in rows.index]
         return convergence.of_degenerate_mode(rows.loc[degenerate]) + of_factors
-    if from_mode or "effective_draws" in attrs:
+    if from_mode or "effective_draws" in view.attrs:
         return of_factors if from_mode else []
-    sizes = group(result, "posterior").sizes
-    stats = group(result, "sample_stats") if has_group(result, "sample_stats") else {}
-    divergences = int(stats["diverging"].sum()) if "diverging" in stats else 0
-    rows = summary(result) if table is None else table
-    return convergence.messages(rows, sizes["chain"], sizes["draw"], divergences) + of_factors
+    rows = summary(view) if table is None else table
+    sizes = view.posterior.sizes
+    return convergence.messages(rows, sizes["chain"], sizes["draw"], int(view.divergences.sum())) + of_factors
 
 
 def mcse_mean(values: np.ndarray) -> float:
@@ -359,24 +282,19 @@ def psis(log_ratio: np.ndarray, relative_efficiency: float = 1.0) -> tuple[np.nd
     return np.asarray(smoothed), float(k)
 
 
-def _mode(result: Any) -> dict[str, dict[str, float]]:
+def _mode(view: ResultView) -> dict[str, dict[str, float]]:
     """Return the column of a summary that holds the posterior mode; none where the result does not tell it."""
-    mode = json.loads(str(attributes(result).get(MODE, "{}")))
-    posterior = group(result, "posterior")
-    values = {name.replace("/", "."): np.asarray(value, float) for name, value in mode.items()}
+    posterior = view.posterior
+    values = {name.replace("/", "."): np.asarray(value, float) for name, value in view.decoded(MODE).items()}
     named = {name: (posterior[name].dims[2:], value) for name, value in values.items() if name in posterior}
     modes = xr.Dataset(named, {dim: posterior[dim] for dims, _ in named.values() for dim in dims if dim in posterior})
     return {"mode": scalar_truth(posterior, modes)} if named else {}
 
 
-def _degenerate(result: Any) -> list[str]:
+def _degenerate(view: ResultView) -> list[str]:
     """Return the labels of the parameters whose mode is degenerate."""
-    entries = json.loads(str(attributes(result).get(DEGENERATE, "{}")))
-    if not entries:
-        return []
-    posterior = group(result, "posterior")
-    variables = {site.replace("/", "."): indices for site, indices in entries.items()}
-    labels = {name: list(scalar_draws(posterior[[name]])) for name in variables if name in posterior}
+    variables = {site.replace("/", "."): indices for site, indices in view.decoded(DEGENERATE).items()}
+    labels = {name: list(scalar_draws(view.posterior[[name]])) for name in variables if name in view.posterior}
     return [labels[name][index] for name, indices in variables.items() if name in labels for index in indices]
 
 

@@ -6,14 +6,14 @@ as a lengthscale in space; they are then computed for each draw.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.results.arviz_data import add_group, group, has_group
+from lfm_ppl.results.arviz_data import add_group
+from lfm_ppl.results.result_view import ResultView
 
 GROUP = "field_"
 """Prefix of the names of groups that hold stored fields."""
@@ -53,11 +53,12 @@ def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any 
     """
     import jax  # figures of a stored field need no JAX
 
-    trajectories = group(result, "trajectories")
-    posterior = group(result, "posterior").sel(draw=trajectories["draw"]).transpose("chain", "draw", ...)
+    view = ResultView.of(result)
+    trajectories = view.group("trajectories")
+    posterior = view.posterior.sel(draw=trajectories["draw"]).transpose("chain", "draw", ...)
     parameters = {str(label): variable.values.reshape(-1, *variable.shape[2:]) for label, variable in posterior.items()}
     count = posterior.sizes["chain"] * posterior.sizes["draw"]
-    for label, value in json.loads(result.attrs.get("fixed", "{}")).items():
+    for label, value in view.decoded("fixed").items():
         parameters.setdefault(label, np.broadcast_to(value, (count, *np.shape(value))))
 
     def make(values: Mapping[str, Any]) -> Any:
@@ -74,7 +75,7 @@ def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any 
     variables = {"draws": (("chain", "draw", *dims), draws.reshape(*values.shape[:2], *draws.shape[1:])),
                  "mean": (dims, draws.mean(0)),
                  "sd": (dims, np.sqrt(draws.var(0) + np.asarray(variance).mean(0)))}
-    if (truth := _truth(result, make, positions, times)) is not None:
+    if (truth := _truth(view, make, positions, times)) is not None:
         variables["truth"] = (dims, truth)
     if sensors is not None:
         sensor_positions = np.stack([np.asarray(sensors(t) if callable(sensors) else sensors, float) for t in times])
@@ -85,8 +86,9 @@ def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any 
 
 def add_fields(result: Any, fields: Mapping[str, Mapping[str, Any]]) -> None:
     """Store fields in a result that has trajectories: name -> keyword arguments of `evaluate_field`."""
-    for name, arguments in fields.items() if has_group(result, "trajectories") else ():
-        add_group(result, f"{GROUP}{name}", evaluate_field(result, name=name, **arguments).drop_vars("draws"))
+    view = ResultView.of(result)
+    for name, arguments in fields.items() if "trajectories" in view.groups else ():
+        add_group(result, f"{GROUP}{name}", evaluate_field(view, name=name, **arguments).drop_vars("draws"))
 
 
 def _coefficients(dataset: xr.Dataset, names: tuple[str, ...]) -> xr.DataArray:
@@ -98,10 +100,10 @@ def _coefficients(dataset: xr.Dataset, names: tuple[str, ...]) -> xr.DataArray:
                      "field. Was its model made with this field?")
 
 
-def _truth(result: Any, make: Callable[[Any], Any], positions: np.ndarray, times: np.ndarray) -> np.ndarray | None:
+def _truth(view: ResultView, make: Callable[[Any], Any], positions: np.ndarray, times: np.ndarray) -> np.ndarray | None:
     """Return the true field (K, P) where its coefficients and parameters are known."""
     try:
-        truth = group(result, "truth")
+        truth = view.group("truth")
         field = make({str(label): variable.values for label, variable in truth.items()})
         paths = _coefficients(truth, field.names)
     except (KeyError, ValueError):

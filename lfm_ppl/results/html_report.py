@@ -27,11 +27,12 @@ from markupsafe import Markup
 
 from lfm_ppl.accuracy import report
 from lfm_ppl.results import arviz_data, predictions, tables
-from lfm_ppl.results.inputs import ORIGIN, input_unit, inputs_of, time_origin, time_unit
+from lfm_ppl.results.inputs import ORIGIN
 from lfm_ppl.results.plots import saving
 from lfm_ppl.results.residuals import misfit
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.scalars import unit_of
-from lfm_ppl.results.series import TIMES, select_series, series_dimension, series_labels, times_of
+from lfm_ppl.results.series import TIMES, series_view, times_of
 from lfm_ppl.storage.files import POSTERIOR
 from lfm_ppl.utils import calendar_time
 from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
@@ -98,28 +99,27 @@ def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figur
     """
     path = Path(path) / NAME if Path(path).is_dir() else Path(path)
     refuse_existing(path, overwrite)
-    arviz_data.refuse_several_sites(result)
-    attrs = arviz_data.attributes(result)
-    table = tables.annotate(arviz_data.summary(result), result)
-    pictures, failures = _draw_figures(result) if figures is None else (
+    view = ResultView.of(result)
+    view.refuse_several_sites()
+    attrs = view.attrs
+    table = tables.annotate(arviz_data.summary(view), view)
+    pictures, failures = _draw_figures(view) if figures is None else (
         {Path(figure).stem: Path(figure).read_bytes() for figure in figures}, [])
     diagnostics = [name for name in _DIAGNOSTICS if name in table]
     description = str(attrs.get("description", "")).strip()
-    has_accuracy = arviz_data.has_group(result, report.GROUP)
     return write_page(
         path, overwrite, str(attrs.get("model", "model")), description.partition("\n")[0], pictures,
-        result={"partial": attrs.get("partial"), "messages": arviz_data.convergence_warnings(result),
-                "misfit": misfit(result), "is_mode": arviz_data.of_mode(result), "table": _short(table, result),
+        result={"partial": attrs.get("partial"), "messages": arviz_data.convergence_warnings(view, table),
+                "misfit": misfit(view), "is_mode": view.is_about_mode, "table": _short(table, view),
                 "is_weighted": "effective_draws" in attrs},
-        forecast=_forecast(result, more or {}),
-        accuracy=_accuracy(result, path.parent) if has_accuracy else {"is_constrained": "constraints" in attrs},
+        forecast=_forecast(view, more or {}), accuracy=_accuracy(view, path.parent),
         failures=failures, convergence=table[diagnostics] if diagnostics and len(table) else None,
         model={"name": attrs.get("model"), "file": attrs.get("model_file"), "paragraphs": _paragraphs(description),
-               "priors": _priors(attrs), "assumptions": json.loads(str(attrs.get("assumptions", "{}")))},
-        data=_data(result, attrs) if arviz_data.has_group(result, "data") else {},
+               "priors": _priors(view), "assumptions": view.decoded("assumptions")},
+        data=_data(view) if "data" in view.groups else {},
         settings={name: text for name, value in attrs.items()
                   if name not in _NOT_SETTINGS and (text := _plain(value))} or None,
-        repeat={"commands": _commands(result, attrs), "note": ""}, files=_files(path) or None)
+        repeat={"commands": _commands(view), "note": ""}, files=_files(path) or None)
 
 
 def write_page(path: str | Path, overwrite: bool, title: str, lead: str, pictures: Mapping[str, bytes],
@@ -167,24 +167,24 @@ def _column_kinds(frame: pd.DataFrame) -> list[tuple[str, str]]:
             for name, column in frame.items()]
 
 
-def _draw_figures(result: Any) -> tuple[dict[str, bytes], list[str]]:
+def _draw_figures(view: ResultView) -> tuple[dict[str, bytes], list[str]]:
     """Return the figures of a result, name -> PNG, and a message for each that could not be drawn."""
     pictures, failures = {}, []
-    for name, draw, names in saving.pages_of(result, "full"):
+    for name, draw, names in saving.pages_of(view, "full"):
         try:
             with io.BytesIO() as buffer:
-                draw(result, names, width="full").savefig(buffer, format="png")
+                draw(view, names, width="full").savefig(buffer, format="png")
                 pictures[name] = buffer.getvalue()
         except Exception as error:  # the page is worth having without it
             failures.append(f"The figure {name} could not be drawn: {error}")
     return pictures, failures
 
 
-def _short(table: pd.DataFrame, result: Any) -> pd.DataFrame:
+def _short(table: pd.DataFrame, view: ResultView) -> pd.DataFrame:
     """Return the table of the parameters without diagnostics; warnings on all of them stand above it."""
     if table.empty:
         return table
-    messages = {label: arviz_data.convergence_warnings(result, table.loc[[label]]) for label in table.index}
+    messages = {label: arviz_data.convergence_warnings(view, table.loc[[label]]) for label in table.index}
     shared = set.intersection(*map(set, messages.values()))
     rows = ["; ".join(message.partition(": ")[0] for message in messages[label] if message not in shared)
             for label in table.index]
@@ -192,10 +192,9 @@ def _short(table: pd.DataFrame, result: Any) -> pd.DataFrame:
     return table.assign(warnings=rows) if any(rows) else table
 
 
-def _priors(attrs: Mapping[str, Any]) -> pd.DataFrame:
+def _priors(view: ResultView) -> pd.DataFrame:
     """Return the prior of each parameter in words, and its meaning where the model file tells it."""
-    priors, meanings = (json.loads(str(attrs.get(name, "{}"))) for name in ("priors", "meanings"))
-    table = pd.DataFrame({"prior": priors}, dtype=object)
+    table, meanings = pd.DataFrame({"prior": view.decoded("priors")}, dtype=object), view.decoded("meanings")
     return table.assign(meaning=[meanings.get(name, "") for name in table.index]) if any(meanings.values()) else table
 
 
@@ -211,26 +210,25 @@ def _paragraphs(text: str) -> list[tuple[bool, str]]:
             else (False, " ".join(block.split())) for block in blocks]
 
 
-def _data(result: Any, attrs: Mapping[str, Any]) -> dict[str, Any]:
-    dataset = arviz_data.group(result, "data")
+def _data(view: ResultView) -> dict[str, Any]:
+    dataset = view.group("data")
     name = next(str(label) for label in dataset.data_vars if label != TIMES)
-    variable, origin = dataset[name], _origin(result)
+    variable, origin = dataset[name], _origin(view)
     times = np.asarray(times_of(dataset).values, float)
     names = [str(output) for output in variable["output"].values] if "output" in variable.coords else [name]
     columns = np.asarray(variable.values, float).reshape(-1, len(names)).T
-    inputs = inputs_of(result)
-    facts = {"source": attrs.get("data"), "series": variable.sizes.get(series_dimension(result)),
+    facts = {"source": view.attrs.get("data"), "series": variable.sizes.get(view.series_dimension),
              "rows": variable.sizes["time"],
-             "missing": f"{int(variable.isnull().sum())} of {variable.size} values", "times": _span(times, result),
-             "time 0": calendar_time.clock(0.0, origin, time_unit(result)) if origin else None,
-             "note": attrs.get("note")}
-    described = [_described(np.asarray(table.values, float), input_unit(result, label))
-                 | {"interpolation": table.interpolation, "times": _span(np.asarray(table.times), result)}
-                 for label, table in inputs.items()]
+             "missing": f"{int(variable.isnull().sum())} of {variable.size} values", "times": _span(times, view),
+             "time 0": calendar_time.clock(0.0, origin, view.time_unit) if origin else None,
+             "note": view.attrs.get("note")}
+    described = [_described(np.asarray(table.values, float), view.input_unit(label))
+                 | {"interpolation": table.interpolation, "times": _span(np.asarray(table.times), view)}
+                 for label, table in view.inputs.items()]
     return {"facts": {label: text for label, text in facts.items() if text is not None},
             "outputs": pd.DataFrame([_described(column, unit_of(variable, label))
                                      for label, column in zip(names, columns, strict=True)], names),
-            "inputs": pd.DataFrame(described, list(inputs))}
+            "inputs": pd.DataFrame(described, list(view.inputs))}
 
 
 def _described(values: np.ndarray, unit: str) -> dict[str, Any]:
@@ -239,25 +237,27 @@ def _described(values: np.ndarray, unit: str) -> dict[str, Any]:
             "mean": column.mean(), "max": column.max()}
 
 
-def _span(times: np.ndarray, result: Any) -> str:
+def _span(times: np.ndarray, view: ResultView) -> str:
     """Return the first and the last time, as dates where the result knows them."""
-    times, unit = times[np.isfinite(times)], time_unit(result)
+    times, unit = times[np.isfinite(times)], view.time_unit
     if not times.size:
         return "none"
     text = f"{times.min():.10g} to {times.max():.10g}" + (f" {unit}" if unit else "")
-    if origin := _origin(result):
+    if origin := _origin(view):
         first, last = (calendar_time.clock(float(time), origin, unit) for time in (times.min(), times.max()))
         text += f" ({first} to {last})"
     return text
 
 
-def _origin(result: Any) -> str:
+def _origin(view: ResultView) -> str:
     """Return the calendar time of t = 0; empty where it, or the unit that times count, is not known."""
-    return time_origin(result) if time_unit(result) in calendar_time.SECONDS else ""
+    return view.time_origin if view.time_unit in calendar_time.SECONDS else ""
 
 
-def _accuracy(result: Any, folder: Path) -> dict[str, Any]:
-    checked = report.AccuracyReport.of(result)
+def _accuracy(view: ResultView, folder: Path) -> dict[str, Any]:
+    if report.GROUP not in view.groups:
+        return {"is_constrained": "constraints" in view.attrs}
+    checked = report.AccuracyReport.of(view)
     verdict, remedies = checked.verdict, list(checked.verdict.remedies)
     path = shlex.quote(str(folder)) if (folder / POSTERIOR).is_file() else "RESULT"
     if len(remedies) < 2:
@@ -266,14 +266,15 @@ def _accuracy(result: Any, folder: Path) -> dict[str, Any]:
             "facts": dict(checked.numbers()), "table": checked.table[list(report.SHOWN)]}
 
 
-def _forecast(result: Any, more: Mapping[str, pd.DataFrame]) -> dict[str, Any] | None:
+def _forecast(view: ResultView, more: Mapping[str, pd.DataFrame]) -> dict[str, Any] | None:
     """Return tables of the predictions, after the data where any of them are."""
-    if not arviz_data.has_group(result, predictions.GROUP):
+    if predictions.GROUP not in view.groups:
         return {"tables": more, "more": more, "label": "", "count": 0, "most_series": 0, "total": 0} if more else None
-    labels = [] if series_dimension(result) is None else series_labels(result)
-    views = {view.attrs["selected"]: view for view in (select_series(result, label) for label in labels[:_MOST_SERIES])}
-    groups = {title: arviz_data.group(view, predictions.GROUP) for title, view in (views or {"": result}).items()}
-    dataset, unit, origin = next(iter(groups.values())), time_unit(result), _origin(result)
+    labels = view.series_labels
+    members = [series_view(view, label) for label in labels[:_MOST_SERIES]]
+    groups = ({member.attrs["selected"]: member.group(predictions.GROUP) for member in members}
+              or {"": view.group(predictions.GROUP)})
+    dataset, unit, origin = next(iter(groups.values())), view.time_unit, _origin(view)
     later = np.flatnonzero(dataset["time"].values > dataset.attrs.get("last_observation", np.inf))
     index = later if later.size else np.arange(dataset.sizes["time"])
     thinned = index[np.unique(np.linspace(0, index.size - 1, _MOST_TIMES).round().astype(int))]
@@ -300,13 +301,13 @@ def _plain(value: Any) -> str:
     return "" if value is None or isinstance(value, (list, tuple)) and not value else tables.format_number(value, 4)
 
 
-def _commands(result: Any, attrs: Mapping[str, Any]) -> list[str]:
+def _commands(view: ResultView) -> list[str]:
     """Return the commands or calls that give the same numbers, in their order."""
+    attrs = view.attrs
     call = [str(attrs["call"])] if "call" in attrs else []
     if call and "effective_draws" in attrs:
         call += ["lfm.check_accuracy(result, model)", "result = lfm.correct_posterior(result, model)"]
-    groups = [arviz_data.group(result, name) for name in (report.GROUP, predictions.GROUP)
-              if arviz_data.has_group(result, name)]
+    groups = [view.groups[name] for name in (report.GROUP, predictions.GROUP) if name in view.groups]
     first = [str(attrs["command_line"])] if "command_line" in attrs else call
     return [*first, *(str(group.attrs["command_line"]) for group in groups if group.attrs.get("command_line"))]
 

@@ -9,8 +9,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.io.data_set import Data, InputTable
-from lfm_ppl.results import arviz_data
-from lfm_ppl.results.scalars import unit_of, units_attribute
+from lfm_ppl.results.scalars import units_attribute
 
 GROUP = "constant_data"
 """ArviZ's name for what a model is given beside the observations."""
@@ -45,11 +44,8 @@ def to_dataset(inputs: Mapping[str, InputTable], units: Mapping[str, str] | None
     return xr.Dataset(variables, coordinates)
 
 
-def inputs_of(result: Any, group: str = GROUP) -> dict[str, InputTable]:
-    """Return the known inputs that a result was made with, or its forecast."""
-    if not arviz_data.has_group(result, group):
-        return {}
-    stored = arviz_data.group(result, group)
+def from_dataset(stored: xr.Dataset) -> dict[str, InputTable]:
+    """Return the known inputs of `to_dataset`, by name."""
     tables = {}
     for name, variable in stored.data_vars.items():
         parts = {field: np.asarray(stored[f"{name}_{ending}"].values)
@@ -58,11 +54,6 @@ def inputs_of(result: Any, group: str = GROUP) -> dict[str, InputTable]:
             np.asarray(stored[f"{name}_time"].values, float), np.asarray(variable.values, float),
             str(variable.attrs.get("interpolation", "previous")), **parts)
     return tables
-
-
-def input_unit(result: Any, name: str) -> str:
-    """Return the unit of a known input, empty where the result does not know it."""
-    return unit_of(arviz_data.group(result, GROUP)[name]) if name in inputs_of(result) else ""
 
 
 def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | None, unit: str) -> dict[str, Any]:
@@ -77,22 +68,3 @@ def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | Non
             if unit and not dataset[name].attrs.get("units"):
                 dataset[name].attrs["units"] = unit
     return {} if origin is None else {ORIGIN: origin}
-
-
-def time_unit(result: Any) -> str:
-    """Return the unit of time, empty where the result does not know it."""
-    for name, coordinate in (("data", "time"), ("data", "times"), ("trajectories", "at")):
-        if arviz_data.has_group(result, name) and coordinate in (dataset := arviz_data.group(result, name)).coords:
-            if unit := unit_of(dataset[coordinate]):
-                return unit
-    return ""
-
-
-def time_origin(result: Any) -> str:
-    """Return the calendar time of t = 0, empty where times are plain numbers."""
-    return str(arviz_data.attributes(result).get(ORIGIN, ""))
-
-
-def clock_of(result: Any) -> tuple[str | None, str]:
-    """Return the calendar time of t = 0 and the unit that times count, for `calendar_time.in_messages`."""
-    return time_origin(result) or None, time_unit(result)

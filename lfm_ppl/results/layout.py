@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,8 +24,9 @@ from lfm_ppl.inference.trajectories import LOG_PRIOR
 from lfm_ppl.io.truth import TRUTH, check_truth
 from lfm_ppl.model.observation_noise import expected_observation
 from lfm_ppl.results.predictions import GROUP, INTERVAL, NOISE_FREE, PERIODS, REGIMES, mixture_quantiles, predictions
+from lfm_ppl.results.result_view import ENTRY
 from lfm_ppl.results.scalars import DERIVED, units_attribute
-from lfm_ppl.results.series import ENTRY, SERIES, plate_dimension, time_coordinate, times_of
+from lfm_ppl.results.series import SERIES, plate_dimension, time_coordinate, times_of
 from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:
@@ -177,7 +179,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
     is_observed = np.isfinite(y)
     entries = entry_coordinates(data, is_observed)
     groups = {
-        # Between sites, outputs differ: a parameter with an entry for each output of one site may belong to another.
+        # Sites differ in their outputs, and the dimension "output" of a parameter does not say whose they are.
         "posterior": _posterior(draws, coords, {**named, OUTPUT: []} if bound.is_by_site else named, labels),
         "sample_stats": xr.Dataset({k: (("chain", "draw"), v) for k, v in stats.items()}, coords),
         "data": data,
@@ -309,13 +311,9 @@ def _posterior(draws: dict, coords: dict, named: Mapping[str, list], labels: Lab
         shape = value.shape[2:]
         site_dims = labels.dims.get(label, (None,) * len(shape))
         site_dims = site_dims if len(site_dims) == len(shape) else (None,) * len(shape)
-        if site_dims == (None,) and shape[0] == len(named[OUTPUT]) > 1:
-            site_dims = (OUTPUT,)
         dims = [name or f"{label}_dim_{axis}" for axis, name in enumerate(site_dims)]
         for name, size in zip(dims, shape, strict=True):
             ticks = labels.coords.get(name, named.get(name, ()))
-            if not len(ticks) and site_dims == (name,) and size > 1:
-                ticks = named[OUTPUT]  # of a plate with an entry for each output
             extra[name] = list(ticks) if len(ticks) == size else np.arange(size)
         variables[label] = (("chain", "draw", *dims), value, {DERIVED: 1} if label in labels.derived else {})
     return xr.Dataset(variables, {**coords, **extra})
@@ -325,7 +323,8 @@ def _true_functions(bound: BoundModel, truth: Mapping[str, Any],
                     draws: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return outputs (K, D), noise-free, and deterministics (K, Q) along the true path, where all of it is known.
 
-    The dictionary is empty if the model raises an error for the truth, or fixes a parameter at another value.
+    The dictionary is empty if the model fixes a parameter at another value. So it is if the model raises an error for
+    the truth, of which a warning tells.
     """
     parameters, forces = truth.get("parameters") or {}, truth.get("forces") or {}
     model = bound.site.example.ssm.model
@@ -339,19 +338,18 @@ def _true_functions(bound: BoundModel, truth: Mapping[str, Any],
         return {}
     if any(_is_fixed_elsewhere(draws[name], parameters[name]) for name in set(parameters) & set(draws)):
         return {}
+    values = {name: np.broadcast_to(np.asarray(parameters[name], float), draws[name].shape[2:]) for name in bound.sites}
+    w = jnp.asarray(np.column_stack(parts))
     try:
-        values = {name: np.broadcast_to(np.asarray(parameters[name], float), draws[name].shape[2:])
-                  for name in bound.sites}
         ssm = bound.likelihood(values).ssm
-        w = jnp.asarray(np.column_stack(parts))
-        series = {OUTPUT: np.asarray(jax.vmap(lambda inputs, t: expected_observation(ssm, inputs, t))(w, times))}
-    except Exception:
+        series = {OUTPUT: np.asarray(jax.vmap(functools.partial(expected_observation, ssm))(w, jnp.asarray(times)))}
+        if model.deterministic_names:
+            series["deterministic"] = np.asarray(jax.vmap(ssm.deterministics)(w, times))
+    except Exception as error:  # of user code; the draws are worth having without it
+        checks.warn("the true outputs are left out of the figures: at the true parameters the model raises "
+                    f"{type(error).__name__}: {error}")
         return {}
-    try:
-        more = {"deterministic": np.asarray(jax.vmap(ssm.deterministics)(w, times))}
-    except Exception:
-        return series
-    return series | (more if model.deterministic_names else {})
+    return series
 
 
 def _is_fixed_elsewhere(draws: np.ndarray, truth: Any) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.result_view import ResultView
 
 _STRUCTURE = "structure"
 """Name of the entry that holds attributes, groups, dimensions and names as JSON."""
@@ -18,9 +19,10 @@ _STRUCTURE = "structure"
 def pack_result(result: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Return an ArviZ object as arrays by name, with further attributes."""
     arrays: dict[str, Any] = {}
-    structure: dict[str, Any] = {"attrs": {**arviz_data.attributes(result), **attributes}, "groups": {}}
-    for group in arviz_data.groups(result):
-        description = arviz_data.group(result, group).to_dict(data="array")
+    view = ResultView.of(result)
+    structure: dict[str, Any] = {"attrs": {**view.attrs, **attributes}, "groups": {}}
+    for group, dataset in view.groups.items():
+        description = dataset.to_dict(data="array")
         for part in ("coords", "data_vars"):
             for name, variable in description[part].items():
                 values = np.asarray(variable.pop("data"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import re
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -28,9 +27,9 @@ from lfm_ppl.likelihoods.handlers.approximate import complete
 from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite
 from lfm_ppl.linearisation.named_rules import named_rule
 from lfm_ppl.model.inputs import Input
-from lfm_ppl.results import arviz_data, inputs
-from lfm_ppl.results.series import TIMES, is_selected_series, series_labels, times_of
-from lfm_ppl.results.sites import is_selected_site, select_site
+from lfm_ppl.results.result_view import ResultView
+from lfm_ppl.results.series import TIMES, times_of
+from lfm_ppl.results.sites import site_view
 from lfm_ppl.utils import calendar_time
 
 _TOLERANCE = 1e-6
@@ -46,9 +45,10 @@ def observations(result: Any) -> tuple[Any, Any]:
     Raises:
         ValueError: the result holds no data.
     """
-    if sites := {name: observations(select_site(result, name)) for name in arviz_data.sites_of(result)}:
+    view = ResultView.of(result)
+    if sites := {name: observations(site_view(view, name)) for name in view.likelihood_sites}:
         return {name: times for name, (times, _) in sites.items()}, {name: y for name, (_, y) in sites.items()}
-    data = arviz_data.group(result, "data")
+    data = view.group("data")
     names = [name for name in data.data_vars if name != TIMES]
     if len(names) != 1 or not {TIMES, "time"} & set(data.variables):
         raise ValueError(f"the group data holds {', '.join(map(str, data.variables)) or 'nothing'}; expected "
@@ -64,11 +64,12 @@ def keywords(result: Any, later: Mapping[str, Any] | None, overrides: Mapping[st
         later: known inputs that continue the fit's, and further arguments, see `lfm_ppl.forecast`; or None.
         overrides: keyword arguments that replace these.
     """
-    if sites := arviz_data.sites_of(result):
-        return keywords_by_site({name: keywords(select_site(result, name), (later or {}).get(name), None)
+    view = ResultView.of(result)
+    if sites := view.likelihood_sites:
+        return keywords_by_site({name: keywords(site_view(view, name), (later or {}).get(name), None)
                                  for name in sites}) | dict(overrides or {})
-    stored = inputs.inputs_of(result)
-    continued = stored | continued_tables(result, later or {})
+    stored = view.inputs
+    continued = stored | continued_tables(view, later or {})
     arguments = model_keywords(stored, overrides)
     further = {name: value for name, value in (later or {}).items() if name not in stored}
     if len(further) < len(later or {}):
@@ -92,11 +93,12 @@ def continued_tables(result: Any, later: Mapping[str, Any]) -> dict[str, InputTa
         ValueError: a known input is read in another manner than in the fit, or differs from it before the last
             observation.
     """
-    stored, clock = inputs.inputs_of(result), inputs.clock_of(result)
+    view = ResultView.of(result)
+    stored, clock = view.inputs, view.clock
     tables = {name: _later_table(name, value, stored[name], clock) for name, value in later.items() if name in stored}
     continued = continued_inputs(stored, tables)
     for name, table in continued.items():
-        span = observed_span(result, name.partition(OF_SERIES)[2])
+        span = observed_span(view, name.partition(OF_SERIES)[2])
         check_difference = _check_doses if table.is_dose else _check_function
         with calendar_time.in_messages(*clock):
             check_difference(name, stored[name], table, *span)
@@ -118,11 +120,12 @@ def _later_table(name: str, value: Any, stored: InputTable, clock: tuple[str | N
 
 def observed_span(result: Any, series: str = "") -> tuple[float, float]:
     """Return the times of the first row and of the last observation, of a series or of all; infinite without any."""
-    times, y = observations(result)
+    view = ResultView.of(result)
+    times, y = observations(view)
     is_observed = np.isfinite(y).any(axis=-1)
     times = np.broadcast_to(times, is_observed.shape)
     if series:
-        index = list(map(str, series_labels(result))).index(series)
+        index = list(map(str, view.series_labels)).index(series)
         times, is_observed = times[index], is_observed[index]
     return float(times.min()), float(np.max(times[is_observed], initial=-np.inf))
 
@@ -186,18 +189,18 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
             settings, other parameters.
         TypeError: the model needs a keyword argument; the message names it.
     """
-    if is_selected_series(result) or is_selected_site(result):
+    view = ResultView.of(result)
+    if view.is_part:
         raise ValueError("the result is one series of a panel or one of several likelihood sites, and its model is "
                          "that of all; take the result that it was selected from.")
-    posterior = arviz_data.group(result, "posterior")
-    attrs = arviz_data.attributes(result)
+    posterior = view.posterior
     if times is None or y is None:
-        stored = observations(result)
+        stored = observations(view)
         times, y = stored[0] if times is None else times, stored[1] if y is None else y
-    arguments = keywords(result, None, model_kwargs)
-    settings = arviz_data.sites_of(result)
+    arguments = keywords(view, None, model_kwargs)
+    settings = dict(view.likelihood_sites)
     try:
-        bound = bind(_as_fitted(numpyro_model, settings or {"": attrs}), times, y, **arguments)
+        bound = bind(_as_fitted(numpyro_model, settings or {"": dict(view.attrs)}), times, y, **arguments)
     except (TypeError, AttributeError) as error:
         missing = _missing_keywords(numpyro_model, arguments)
         if not missing or not re.search("NoneType|required", str(error)):
@@ -205,8 +208,8 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
         example = ", ".join(f"{name!r}: ..." for name in missing)
         raise TypeError(f"the model needs {', '.join(missing)}: pass model_kwargs={{{example}}}.") from error
     for name, site_model in bound.site_models.items():
-        _check_settings(site_model.site, settings.get(name, {}) if settings else attrs)
-    bound = bound.fix(json.loads(attrs.get("fixed") or "{}"))
+        _check_settings(site_model.site, settings.get(name, {}) if settings else view.attrs)
+    bound = bound.fix(view.decoded("fixed"))
     if not bound.sites:
         raise ValueError("the model has no parameters that are sampled, so there is nothing to check.")
     return LikelihoodProblem(bound, parameter_draws(bound, posterior))
@@ -246,9 +249,10 @@ def check_likelihood(result: Any, log_likelihood: np.ndarray, draw_index: np.nda
     Raises:
         ValueError: they differ: model, options or data are not the ones of the result.
     """
-    if not arviz_data.has_group(result, "one_step_ahead"):
+    groups = ResultView.of(result).groups
+    if "one_step_ahead" not in groups:
         return
-    terms = arviz_data.group(result, "one_step_ahead")["log_density"].transpose("chain", "draw", ...)
+    terms = groups["one_step_ahead"]["log_density"].transpose("chain", "draw", ...)
     recorded = terms.isel(draw=draw_index).values.reshape(*log_likelihood.shape, -1).sum(axis=-1)
     difference = np.abs(recorded - log_likelihood)
     if np.any(difference > _TOLERANCE * (1.0 + np.abs(recorded))):

@@ -16,8 +16,7 @@ import pandas as pd
 import xarray as xr
 from scipy import stats
 
-from lfm_ppl.results.arviz_data import attributes, group, has_group
-from lfm_ppl.results.series import series_dimension
+from lfm_ppl.results.result_view import ResultView
 
 MIN_OBSERVATIONS = 8
 _FAR, _RARE = 3.0, 1e-3
@@ -33,7 +32,7 @@ def mean_residuals(result: Any) -> xr.DataArray:
     Raises:
         ValueError: the group is missing.
     """
-    residual = group(result, "one_step_ahead")["residual"]
+    residual = ResultView.of(result).group("one_step_ahead")["residual"]
     return residual.mean(("chain", "draw"), skipna=False).transpose("time", "output")
 
 
@@ -122,12 +121,12 @@ def misfit(result: Any) -> list[str]:
     the Kolmogorov-Smirnov and the Ljung-Box test. Nothing is said of a panel, and of a result whose residuals are those
     of another filter than its posterior: under constraints, and by a particle filter.
     """
-    attrs = attributes(result)
-    is_approximate = "constraints" in attrs or str(attrs.get("sampler", "")).startswith("pmmh")
-    if is_approximate or not has_group(result, "one_step_ahead") or series_dimension(result) is not None:
+    view = ResultView.of(result)
+    is_approximate = "constraints" in view.attrs or str(view.attrs.get("sampler", "")).startswith("pmmh")
+    if is_approximate or "one_step_ahead" not in view.groups or view.series_dimension is not None:
         return []
-    remedy = "" if "factors" in attrs else " (lfm.StudentTObservation)"
-    messages, residual, tests = [], mean_residuals(result), residual_tests(result)
+    remedy = "" if "factors" in view.attrs else " (lfm.StudentTObservation)"
+    messages, residual, tests = [], mean_residuals(view), residual_tests(view)
     for index in range(residual.sizes["output"]):
         name, test = tests.index[index], tests.iloc[index]
         series = residual.isel(output=index).values

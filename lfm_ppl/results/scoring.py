@@ -20,9 +20,8 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from lfm_ppl.io.data_set import Data, at_origin, in_unit
-from lfm_ppl.results import arviz_data
-from lfm_ppl.results.inputs import clock_of
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable, quantiles
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.gaussian_residuals import TURN
 
@@ -105,11 +104,12 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
     """
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level}.")
-    predicted = result if isinstance(result, xr.Dataset) else arviz_data.group(result, GROUP)
+    view = None if isinstance(result, xr.Dataset) else ResultView.of(result)
+    predicted = result if view is None else view.group(GROUP)
     variable = observed_variable(predicted)
     series = [str(dim) for dim in variable.dims if dim not in ("chain", "draw", "time", "output")]
     outputs = [str(name) for name in variable["output"].values]
-    clock = (None, "") if isinstance(result, xr.Dataset) else clock_of(result)
+    clock = (None, "") if view is None else view.clock
     predicted, y = aligned(predicted, variable, _on_clock(held_out, *clock), series)
     variable, names = observed_variable(predicted), [str(name) for name in predicted["output"].values]
     mean, sd = (flat_draws(predicted[name]) if name in predicted else None for name in (MEAN, SD))
@@ -119,7 +119,7 @@ def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Cal
         columns = [outputs.index(name) for name in names]
         full = np.full((*y.shape[:-1], len(outputs)), np.nan)
         full[..., columns] = y
-        densities = _family_densities(result, numpyro_model, predicted, full, inputs, model_kwargs)[..., columns]
+        densities = _family_densities(view, numpyro_model, predicted, full, inputs, model_kwargs)[..., columns]
     angular = np.isin(names, json.loads(variable.attrs.get("angular") or "[]"))
     period = float(variable.attrs.get("period", TURN))
     return table(scores(flat_draws(variable), y, mean, sd, level, angular, densities, period), names, level)
@@ -166,17 +166,17 @@ def scores(draws: np.ndarray, y: np.ndarray, mean: np.ndarray | None = None, sd:
     return Scores(error, crps(draws, y), log_score, np.where(present, is_covered, np.nan))
 
 
-def _family_densities(result: Any, numpyro_model: Callable, predicted: xr.Dataset, y: np.ndarray,
+def _family_densities(view: ResultView | None, numpyro_model: Callable, predicted: xr.Dataset, y: np.ndarray,
                       inputs: Mapping[str, Any] | None, model_kwargs: Mapping[str, Any] | None) -> np.ndarray:
     """Return the log densities (S, ...) of an observation family."""
     from lfm_ppl.results import rebuilding  # figures and tables of scores need no JAX
     from lfm_ppl.results.family_scores import log_densities
 
-    if isinstance(result, xr.Dataset):
+    if view is None:
         raise ValueError("the log score of an observation family takes the parameters of each draw; pass what "
                          "lfm.forecast returned, not its dataset.")
-    problem = rebuilding.problem(result, numpyro_model, model_kwargs=rebuilding.keywords(result, inputs, model_kwargs))
-    posterior = arviz_data.group(result, "posterior")
+    problem = rebuilding.problem(view, numpyro_model, model_kwargs=rebuilding.keywords(view, inputs, model_kwargs))
+    posterior = view.posterior
     draw_index = np.searchsorted(posterior["draw"].values, predicted["draw"].values)
     rows = (np.arange(posterior.sizes["chain"])[:, None] * posterior.sizes["draw"] + draw_index).ravel()
     return log_densities(problem.bound, problem.select(rows).draws, predicted, y)

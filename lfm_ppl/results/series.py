@@ -18,6 +18,7 @@ import xarray as xr
 
 from lfm_ppl.io.data_set import OF_SERIES
 from lfm_ppl.results import arviz_data, inputs
+from lfm_ppl.results.result_view import DIMENSIONS, ENTRY, SELECTED_SERIES, ResultView
 from lfm_ppl.results.scalars import unit_of, units_attribute
 from lfm_ppl.utils import checks
 
@@ -30,18 +31,8 @@ SERIES = "series"
 TIMES = "times"
 """Coordinate (series, time) or (series, at) of series that have times of their own."""
 
-ENTRY = "observation"
-"""Dimension of the observed entries, with the coordinates time, output and series, in the groups that ArviZ reads."""
-
-_OTHER_DIMENSIONS = (ENTRY, "chain", "draw", "time", "at", "at_truth", "output", "state", "force", "deterministic",
-                     "statistic", "parameter")
-"""Dimensions of a result that a plate cannot give its name to."""
-
 _NOT_OF_SERIES = ("accuracy",)
 """Groups about the panel as a whole."""
-
-_PANEL = "selected_series"
-"""Attribute of a selected series: what `panel_of` needs besides its groups, as JSON."""
 
 
 def plate_dimension(bound: BoundModel) -> str | None:
@@ -49,20 +40,7 @@ def plate_dimension(bound: BoundModel) -> str | None:
     if np.ndim(bound.y) != 3:
         return None
     plates = [frame.name for frame in bound.trace()[bound.site.name].get("cond_indep_stack", ())]
-    return plates[0] if len(plates) == 1 and plates[0] not in _OTHER_DIMENSIONS else SERIES
-
-
-def series_dimension(result: Any) -> str | None:
-    """Return the dimension of the series of a result; None where it is of one series."""
-    if not arviz_data.has_group(result, "data") or arviz_data.sites_of(result):
-        return None
-    dims = arviz_data.group(result, "data").dims
-    return next((str(name) for name in dims if name not in _OTHER_DIMENSIONS), None)
-
-
-def series_labels(result: Any) -> list[Any]:
-    """Return the labels of the series of a panel, or their positions where a result has none."""
-    return arviz_data.group(result, "data")[series_dimension(result)].values.tolist()
+    return plates[0] if len(plates) == 1 and plates[0] not in DIMENSIONS else SERIES
 
 
 def times_of(dataset: xr.Dataset, clock: str = "time") -> xr.DataArray:
@@ -103,53 +81,52 @@ def select_series(result: Any, series: Any) -> Any:
         >>> one["data"]["y"].values.ravel().tolist(), one["posterior"]["rate"].dims
         ([2.0, 3.0], ('chain', 'draw'))
     """
-    dimension = series_dimension(result)
+    selected = series_view(ResultView.of(result), series)
+    return arviz_data.build(selected.groups, selected.attrs)
+
+
+def series_view(view: ResultView, series: Any) -> ResultView:
+    """Return the view of one series of a panel, see `select_series`."""
+    dimension, labels = view.series_dimension, view.series_labels
     if dimension is None:
         raise ValueError("the result is of one series, so that there is none to select; take the result.")
-    labels = series_labels(result)
     index = _position(labels, series)
-    observed = arviz_data.group(result, "data")
+    observed = view.group("data")
     name = next(label for label in observed.data_vars if dimension in observed[label].dims and label != TIMES)
     is_observed = observed[name].notnull().any("output").transpose(dimension, "time").values
     times = _select(observed, dimension, index, labels[index])["time"].values
     is_later = np.diff(times, prepend=-np.inf) > 0
     groups = {}
-    for label in arviz_data.groups(result):
+    for label, dataset in view.groups.items():
         if label in _NOT_OF_SERIES:
             continue
-        dataset = _select(arviz_data.group(result, label), dimension, index, labels[index])
+        dataset = _select(dataset, dimension, index, labels[index])
         if label in ("data", "one_step_ahead"):
             dataset = dataset.isel(time=is_observed[index] | is_later)
         elif label in (inputs.GROUP, inputs.FORECAST):
-            dataset = _select_inputs(result, label, str(labels[index]))
+            dataset = _select_inputs(view.group(label), str(labels[index]))
         elif label == "predictions":
             last = np.max(times[is_observed[index]], initial=-np.inf)
             dataset = dataset.assign_attrs(last_observation=float(last))
         groups[label] = dataset
-    posterior = arviz_data.group(result, "posterior")
-    attrs = _select_mode(arviz_data.attributes(result), posterior, dimension, index)
+    posterior = view.posterior
     panel = {"dimension": dimension, "labels": labels, "index": index, "has_series_times": TIMES in observed.variables,
              "has_labels": dimension in observed.coords,
              "rows": observed.sizes["time"],
              "axes": {str(label): variable.dims.index(dimension) for label, variable in posterior.data_vars.items()
                       if dimension in variable.dims},
-             "inputs": sorted({label.partition(OF_SERIES)[0] for label in inputs.inputs_of(result)
-                               if OF_SERIES in label})}
-    return arviz_data.build(groups, attrs | {"selected": f"{dimension} {labels[index]}", _PANEL: json.dumps(panel)})
+             "inputs": sorted({label.partition(OF_SERIES)[0] for label in view.inputs if OF_SERIES in label})}
+    attrs = _select_mode(view, dimension, index)
+    return view.with_groups(groups, attrs | {"selected": f"{dimension} {labels[index]}",
+                                             SELECTED_SERIES: json.dumps(panel)})
 
 
-def is_selected_series(result: Any) -> bool:
-    """Return whether a result is one series of a panel, from `select_series`."""
-    return _PANEL in arviz_data.attributes(result)
-
-
-def panel_of(result: Any) -> tuple[Any, Any]:
+def panel_of(view: ResultView) -> tuple[ResultView, Any]:
     """Return a panel in which the other series have no data, and the label of the selected series.
 
     The other series have its times, known inputs and parameters, for a model that needs numbers of all series.
     """
-    attrs = arviz_data.attributes(result)
-    panel = json.loads(attrs[_PANEL])
+    panel = view.decoded(SELECTED_SERIES)
     dimension, labels, index = panel["dimension"], panel["labels"], panel["index"]
     is_selected = xr.DataArray(np.arange(len(labels)) == index, dims=dimension)
 
@@ -167,34 +144,34 @@ def panel_of(result: Any) -> tuple[Any, Any]:
                 {TIMES: ((dimension, "time"), times, dataset["time"].attrs)})
         return filled.assign_coords({dimension: labels}) if panel["has_labels"] else filled
 
-    posterior, observed = (arviz_data.group(result, name) for name in ("posterior", "data"))
+    posterior = view.posterior
     repeated = {name: posterior[name].expand_dims({dimension: len(labels)}, axis)
                 for name, axis in panel["axes"].items()}
     groups = {"posterior": posterior.assign(repeated),
-              "data": without_others(observed, np.nan)}
-    if arviz_data.has_group(result, "one_step_ahead"):
-        groups["one_step_ahead"] = without_others(arviz_data.group(result, "one_step_ahead"), 0.0)
-    if arviz_data.has_group(result, inputs.GROUP):
-        groups[inputs.GROUP] = inputs.to_dataset(of_all_series(result, inputs.inputs_of(result)))
-    return arviz_data.build(groups, {name: value for name, value in attrs.items()
-                                     if name not in (_PANEL, "selected", arviz_data.MODE, arviz_data.DEGENERATE)}
-                            ), labels[index]
+              "data": without_others(view.group("data"), np.nan)}
+    if "one_step_ahead" in view.groups:
+        groups["one_step_ahead"] = without_others(view.groups["one_step_ahead"], 0.0)
+    if inputs.GROUP in view.groups:
+        groups[inputs.GROUP] = inputs.to_dataset(of_all_series(view, view.inputs))
+    attrs = {name: value for name, value in view.attrs.items()
+             if name not in (SELECTED_SERIES, "selected", arviz_data.MODE, arviz_data.DEGENERATE)}
+    return view.with_groups(groups, attrs), labels[index]
 
 
-def of_all_series(result: Any, tables: Mapping[str, Any]) -> dict[str, Any]:
+def of_all_series(view: ResultView, tables: Mapping[str, Any]) -> dict[str, Any]:
     """Return known inputs of a selected series under the names that its panel has for them, the same for all series."""
-    panel = json.loads(arviz_data.attributes(result)[_PANEL])
+    panel = view.decoded(SELECTED_SERIES)
     return {label: value for name, value in tables.items()
             for label in ([f"{name}{OF_SERIES}{series}" for series in panel["labels"]] if name in panel["inputs"]
                           else [name])}
 
 
-def _select_inputs(result: Any, group: str, series: str) -> xr.Dataset:
+def _select_inputs(stored: xr.Dataset, series: str) -> xr.Dataset:
     """Return the known inputs of a series, without its label in their names."""
-    stored = arviz_data.group(result, group)
-    names = {name: name.partition(OF_SERIES) for name in inputs.inputs_of(result, group)}
+    all_tables = inputs.from_dataset(stored)
+    names = {name: name.partition(OF_SERIES) for name in all_tables}
     owned = {name: short for name, (short, _, owner) in names.items() if owner in ("", series)}
-    tables = {owned[name]: table for name, table in inputs.inputs_of(result, group).items() if name in owned}
+    tables = {owned[name]: table for name, table in all_tables.items() if name in owned}
     units = {short: unit_of(stored[name]) for name, short in owned.items()}
     return inputs.to_dataset(tables, {name: unit for name, unit in units.items() if unit})
 
@@ -223,12 +200,11 @@ def _select(dataset: xr.Dataset, dimension: str, index: int, label: Any) -> xr.D
     return dataset.isel(at=np.diff(times.values, prepend=-np.inf) > 0) if clock == "at" else dataset
 
 
-def _select_mode(attrs: Mapping[str, Any], posterior: xr.Dataset, dimension: str, index: int) -> dict[str, Any]:
+def _select_mode(view: ResultView, dimension: str, index: int) -> dict[str, Any]:
     """Return the attributes with the mode of one series, and its degenerate parameters."""
-    modes = json.loads(attrs.get(arviz_data.MODE, "{}"))
-    degenerate = json.loads(attrs.get(arviz_data.DEGENERATE, "{}"))
+    modes, degenerate = view.decoded(arviz_data.MODE), view.decoded(arviz_data.DEGENERATE)
     for name, value in modes.items():
-        variable = posterior.get(name.replace("/", "."))
+        variable = view.posterior.get(name.replace("/", "."))
         if variable is None or dimension not in variable.dims:
             continue
         axis = variable.dims.index(dimension) - 2
@@ -237,4 +213,4 @@ def _select_mode(attrs: Mapping[str, Any], posterior: xr.Dataset, dimension: str
             is_degenerate = np.isin(np.arange(np.size(value)), degenerate[name]).reshape(np.shape(value))
             degenerate[name] = np.flatnonzero(np.take(is_degenerate, index, axis)).tolist()
     changed = {arviz_data.MODE: modes, arviz_data.DEGENERATE: degenerate}
-    return {**attrs, **{name: json.dumps(value) for name, value in changed.items() if name in attrs}}
+    return {**view.attrs, **{name: json.dumps(value) for name, value in changed.items() if name in view.attrs}}

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any
 
 import xarray as xr
 
 from lfm_ppl.results import arviz_data, inputs
+from lfm_ppl.results.result_view import LIKELIHOODS, SELECTED_SITE, ResultView
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.types import Result
 
@@ -32,9 +32,6 @@ _OF_SITE = ("data", "one_step_ahead", "trajectories", "predictions", "truth", "c
 
 _DATA = "data"
 """Group of the observations of a site."""
-
-_SELECTED = "selected_site"
-"""Attribute of a selected site: its name and the settings of all sites, as JSON."""
 
 _VARIABLE = "y"
 """Name of the observations in the view of a site."""
@@ -87,15 +84,21 @@ def select_site(result: Result, name: str) -> Result:
         >>> lfm.select_site(result, "long")["observed_data"]["y"].dims
         ('observation',)
     """
-    settings = arviz_data.sites_of(result)
+    selected = site_view(ResultView.of(result), name)
+    return arviz_data.build(selected.groups, selected.attrs)
+
+
+def site_view(view: ResultView, name: str) -> ResultView:
+    """Return the view of one likelihood site of several, see `select_site`."""
+    settings = view.likelihood_sites
     if name not in settings:
         raise ValueError(checks.unknown("likelihood site", name, settings) if settings else
                          f"the result has one likelihood site, so that {name!r} cannot be selected; take the result "
                          "itself.")
     stored = name.replace("/", ".")
     groups = {}
-    for group in arviz_data.groups(result):
-        dataset, kind = arviz_data.group(result, group), group.removesuffix(f"_{stored}")
+    for group, dataset in view.groups.items():
+        kind = group.removesuffix(f"_{stored}")
         if group in _COMMON:
             groups[group] = dataset
         elif group in _OBSERVED and stored in dataset:
@@ -110,28 +113,21 @@ def select_site(result: Result, name: str) -> Result:
             groups[group] = dataset
     if {"log_likelihood", "observed_data"} <= set(groups):
         groups["log_likelihood"] = groups["log_likelihood"].assign_coords(groups["observed_data"].coords)
-    attributes = {key: value for key, value in arviz_data.attributes(result).items() if key != arviz_data.LIKELIHOODS}
+    attributes = {key: value for key, value in view.attrs.items() if key != LIKELIHOODS}
     selected = json.dumps({"name": name, "sites": settings})
-    return arviz_data.build(groups, attributes | settings[name] | {_SELECTED: selected})
+    return view.with_groups(groups, attributes | settings[name] | {SELECTED_SITE: selected})
 
 
-def is_selected_site(result: Any) -> bool:
-    """Return whether a result is one site of several, from `select_site`."""
-    return _SELECTED in arviz_data.attributes(result)
-
-
-def all_sites_of(result: Any) -> tuple[Any, str]:
-    """Return the result of all sites with the parameters and the data that a model needs, and the selected site."""
-    attributes = arviz_data.attributes(result)
-    selected = json.loads(attributes[_SELECTED])
+def all_sites_of(view: ResultView) -> tuple[ResultView, str]:
+    """Return the view of all sites with the parameters and the data that a model needs, and the selected site."""
+    selected = view.decoded(SELECTED_SITE)
     name, settings = selected["name"], selected["sites"]
-    groups_of_site = {group: arviz_data.group(result, group)
-                      for group in ("posterior", _DATA, "one_step_ahead", inputs.GROUP)
-                      if arviz_data.has_group(result, group)}
+    groups_of_site = {group: view.groups[group] for group in ("posterior", _DATA, "one_step_ahead", inputs.GROUP)
+                      if group in view.groups}
     groups_of_site[_DATA] = groups_of_site[_DATA].rename({_VARIABLE: name})
     groups = merge_sites({name: groups_of_site})
-    groups |= {group: arviz_data.group(result, group) for group in arviz_data.groups(result)
+    groups |= {group: dataset for group, dataset in view.groups.items()
                if group.startswith((f"{inputs.GROUP}_", f"{_DATA}_")) and group not in groups}
     differing = {key for site in settings.values() for key in site}
-    attributes = {key: value for key, value in attributes.items() if key not in (_SELECTED, *differing)}
-    return arviz_data.build(groups, {**attributes, arviz_data.LIKELIHOODS: json.dumps(settings)}), name
+    attributes = {key: value for key, value in view.attrs.items() if key not in (SELECTED_SITE, *differing)}
+    return view.with_groups(groups, {**attributes, LIKELIHOODS: json.dumps(settings)}), name

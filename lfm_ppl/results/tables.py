@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.utils.atomic_files import atomic_write
 
 _FORMATS = {"r_hat": "{:.3f}", "ess_bulk": "{:.0f}", "ess_tail": "{:.0f}"}
@@ -144,11 +145,11 @@ def annotate(table: pd.DataFrame, result: Any) -> pd.DataFrame:
         The table with ``kind`` ("sampled", "derived" from sampled ones, or "fixed") and ``warnings`` (text, empty where
         there are none; warnings on all parameters, such as divergences, stand in each row).
     """
-    posterior = arviz_data.group(result, "posterior")
-    derived = {str(name) for name, variable in posterior.data_vars.items() if variable.attrs.get("derived")}
+    view = ResultView.of(result)
+    derived = {str(name) for name, variable in view.posterior.data_vars.items() if variable.attrs.get("derived")}
     kinds = ["derived" if label.partition("[")[0] in derived else "fixed" if sd == 0.0 else "sampled"
              for label, sd in table["sd"].items()]
-    messages = [" ".join(arviz_data.convergence_warnings(result, table.loc[[label]])) for label in table.index]
+    messages = [" ".join(arviz_data.convergence_warnings(view, table.loc[[label]])) for label in table.index]
     return table.assign(kind=kinds, warnings=messages)
 
 

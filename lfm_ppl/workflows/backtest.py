@@ -22,10 +22,10 @@ from numpy.typing import ArrayLike
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.io.data import as_data
-from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable
 from lfm_ppl.results.rebuilding import parameter_draws
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.scoring import ALL, Scores, gaussian_scores, scores, summary, table
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gaussian_residuals import TURN
@@ -181,9 +181,10 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
             try:
                 result = fit(shared_model, times, past, sampler=sampler, seed=seed, at=times, trajectory_draws=draws,
                              progress=False, **options)
-                predicted = arviz_data.group(result, GROUP).isel(time=future)
+                predicted = ResultView.of(result).group(GROUP).isel(time=future)
             except Exception as error:
-                raise type(error)(f"at the origin {times[origin]:g} (row {origin}): {error}") from error
+                error.add_note(f"at the origin {times[origin]:g} (row {origin})")
+                raise
             draws_of_y = flat_draws(observed_variable(predicted))
             # An observation family has no normal distribution at each draw.
             mean, sd = (flat_draws(predicted[name]) if name in predicted else None for name in (MEAN, SD))
@@ -206,7 +207,7 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
 
 def _of_family(bound: BoundModel, result: Any, predicted: xr.Dataset, y: np.ndarray) -> np.ndarray:
     """Return the log densities (S, H, D) of an observation family along the predicted paths."""
-    posterior = arviz_data.group(result, "posterior").isel(draw=predicted["draw"].values)
+    posterior = ResultView.of(result).posterior.isel(draw=predicted["draw"].values)
     return log_densities(bound, parameter_draws(bound, posterior), predicted, y)
 
 

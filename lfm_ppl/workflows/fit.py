@@ -82,6 +82,9 @@ from lfm_ppl.workflows.fit_starts import FALLBACK, check_init, find_start
 _MODE = "mode"
 """Name of the mode and its draws in the folder of a run."""
 
+_ATTRIBUTES, _DRAWS = "attributes", "draws/"
+"""Entry of the attributes among the arrays of a mode, and prefix of the entries of its draws."""
+
 _MODE_SEARCH = "posterior mode: compiling and searching"
 _START_SEARCH = "start: compiling and searching for starting points"
 
@@ -177,7 +180,8 @@ def fit(
         overwrite: replace a result or an unfinished run in ``checkpoint``.
         attributes: further attributes of the result.
         dims: parameter -> names of its dimensions, ``{"decay": ["gene"]}``. By default the plates around it,
-            ``event_dims`` of NumPyro's ``infer``, and "output" for a vector with one entry for each output.
+            ``event_dims`` of NumPyro's ``infer``. A parameter with an entry for each output has the dimension "output",
+            ``numpyro.sample("decay", prior, infer={"event_dims": ["output"]})``, and the outputs as its labels.
         coords: dimension -> labels, ``{"gene": ["CDKN1A", "SESN1"]}``, also of the dimension "output" (columns of y)
             and of the plate of a panel, whose name is the dimension of the series. By default the column names of a
             data frame are the labels of "output", and series have the labels of an xarray DataArray, or numbers. With
@@ -455,10 +459,11 @@ def _draw_about_mode(problem: FitProblem, store: Checkpoint | None, show_progres
         draws = mode.sample(options.keys["chains"], options.samples)
         degenerate = best_effort("check of the mode", lambda: degenerate_entries(bound, mode, draws), {})
         attributes |= {arviz_data.DEGENERATE: json.dumps(degenerate)} if degenerate else {}
-        return {"": np.asarray(json.dumps(attributes)), **draws}
+        return {_ATTRIBUTES: np.asarray(json.dumps(attributes)),
+                **{f"{_DRAWS}{name}": values for name, values in draws.items()}}
 
     with waiting(_MODE_SEARCH, show_progress and not (store is not None and store.has(_MODE))):
         arrays = compute() if store is None else store.get_or_compute(_MODE, compute)
-    attributes = json.loads(str(arrays.pop("")))
-    values = {name: np.asarray(value)[None] for name, value in arrays.items()}
-    return PosteriorDraws(values, {}, None, attributes)
+    values = {name.removeprefix(_DRAWS): np.asarray(value)[None] for name, value in arrays.items()
+              if name.startswith(_DRAWS)}
+    return PosteriorDraws(values, {}, None, json.loads(str(arrays[_ATTRIBUTES])))

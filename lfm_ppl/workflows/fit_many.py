@@ -24,6 +24,7 @@ from lfm_ppl.parallel.run import outcomes
 from lfm_ppl.parallel.task import Task
 from lfm_ppl.results import arviz_data, tables
 from lfm_ppl.results.packing import unpack_result
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.progress import Console, Reporter
 from lfm_ppl.workflows.fit import fit
@@ -72,7 +73,7 @@ class ManyFits:
         self._compute, self._tasks, self._out, self._task_options = compute, tasks, out, task_options
         self._tables: dict[str, pd.DataFrame] = {}
         self._draws: dict[str, dict[str, xr.Dataset]] = {}
-        self._attrs: dict[str, Any] = {}
+        self._attrs: Mapping[str, Any] = {}
 
     def __len__(self) -> int:
         """Return the number of data sets."""
@@ -91,9 +92,9 @@ class ManyFits:
                 self.failed[name] = outcome.reason
             else:
                 result = unpack_result(outcome.result)
-                self._tables[name], self._attrs = arviz_data.summary(result), arviz_data.attributes(result)
-                self._draws[name] = {group: arviz_data.group(result, group) for group in _GROUPS
-                                     if arviz_data.has_group(result, group)}
+                view = ResultView.of(result)
+                self._tables[name], self._attrs = arviz_data.summary(view), view.attrs
+                self._draws[name] = {group: view.groups[group] for group in _GROUPS if group in view.groups}
             yield Fitted(name, result, outcome.error, outcome.stored)
         if self._out is not None:
             self._write(self._out)

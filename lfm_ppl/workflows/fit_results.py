@@ -37,6 +37,7 @@ from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import remember
 from lfm_ppl.results.layout import Labels, TrajectoryDraws, force_periods, lay_out
 from lfm_ppl.results.predictions import SHOWN_PERIODS, repeats_often
+from lfm_ppl.results.result_view import LIKELIHOODS
 from lfm_ppl.results.sites import merge_sites
 from lfm_ppl.storage.checkpoint import Checkpoint, is_finished
 from lfm_ppl.storage.files import POSTERIOR
@@ -332,7 +333,7 @@ def lay_out_sites(bound: BoundModel, sites: Mapping[str, SiteProblem], values: d
     if bound.is_by_site:
         settings = {name: {key: value for key, value in site.description.items() if value is not None}
                     for name, site in sites.items()}
-        return merge_sites(groups), attributes | {arviz_data.LIKELIHOODS: json.dumps(settings)}
+        return merge_sites(groups), attributes | {LIKELIHOODS: json.dumps(settings)}
     (single,) = groups.values()
     return single, attributes
 
@@ -371,7 +372,7 @@ def finished_result(folder: str | Path, record: Mapping[str, Any]) -> Any:
     if not is_finished(folder):
         return None
     result = arviz_data.load(path)
-    run = arviz_data.attributes(result).get("run")
+    run = result.attrs.get("run")
     if not isinstance(run, Mapping):
         raise ValueError(f"{path} has no record of its run, which cannot be resumed. Start a new run in another "
                          "folder.")

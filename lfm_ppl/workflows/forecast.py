@@ -18,8 +18,9 @@ from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results import inputs as known_inputs
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
-from lfm_ppl.results.series import is_selected_series, of_all_series, panel_of, select_series, series_dimension
-from lfm_ppl.results.sites import all_sites_of, is_selected_site, select_site
+from lfm_ppl.results.result_view import SELECTED_SERIES, ResultView
+from lfm_ppl.results.series import of_all_series, panel_of, series_view
+from lfm_ppl.results.sites import all_sites_of, site_view
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.progress import Console
 from lfm_ppl.utils.random_keys import split_by_name
@@ -115,21 +116,22 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
     (2019), Applied Stochastic Differential Equations, chapter 9, for Gaussian moments and what they miss.
     """
     checks.positive_integer("draws", draws)
-    if is_selected_series(result) or is_selected_site(result):
+    view = ResultView.of(result)
+    if view.is_part:
         options: dict[str, Any] = {"events": events, "model_kwargs": model_kwargs, "draws": draws, "seed": seed,
                                    "progress": progress}
-        return _forecast_selected(result, numpyro_model, times, inputs, options)
-    sites = list(arviz_data.sites_of(result))
+        return _forecast_selected(view, numpyro_model, times, inputs, options)
+    sites = list(view.likelihood_sites)
     requested = {name: of_site("times", times, name, sites) for name in sites} if sites else {"": times}
-    views = {name: select_site(result, name) if sites else result for name in requested}
-    clocks = {name: known_inputs.clock_of(view) for name, view in views.items()}
+    views = {name: site_view(view, name) if sites else view for name in requested}
+    clocks = {name: member.clock for name, member in views.items()}
     requested = {name: _checked(calendar_time.positions("times", values, *clocks[name]))
                  for name, values in requested.items() if values is not None}
-    later = {name: _inputs_by_name(view, of_site("inputs", inputs, name, sites), numpyro_model, clocks[name])
-             for name, view in views.items()}
+    later = {name: _inputs_by_name(member, of_site("inputs", inputs, name, sites), numpyro_model)
+             for name, member in views.items()}
     if sites:
         later = {name: later.get(name, {}) for name in sites}
-    data = dict(zip(("times", "y"), rebuilding.observations(result), strict=True))
+    data = dict(zip(("times", "y"), rebuilding.observations(view), strict=True))
     has_rows, overrides = {}, dict(model_kwargs or {})
     for name, when in requested.items():
         later[name], continued = _continued_rows(later[name], model_kwargs or {}, views[name], when)
@@ -138,17 +140,17 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
         if continued:
             extended = _with_later_rows(views[name], when)
             data = {key: {**data[key], name: value} if sites else value for key, value in extended.items()}
-    keywords = rebuilding.keywords(result, later if sites else later[""], overrides)
-    for name, view in views.items():
+    keywords = rebuilding.keywords(view, later if sites else later[""], overrides)
+    for name, member in views.items():
         if site_events := of_site("events", events, name, sites):
             with calendar_time.in_messages(*clocks[name]):
-                _check_events(view, site_events, numpyro_model)
+                _check_events(member, site_events, numpyro_model)
             earlier = keywords.get("events", {} if sites else ())
             keywords["events"] = ({**earlier, name: [*earlier.get(name, ()), *site_events]} if sites
                                   else [*earlier, *site_events])
     with calendar_time.in_messages(*next(iter(clocks.values()))):
-        problem = rebuilding.problem(result, numpyro_model, model_kwargs=keywords, **data)
-    groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)}
+        problem = rebuilding.problem(view, numpyro_model, model_kwargs=keywords, **data)
+    groups = dict(view.groups)
     keys = split_by_name(keys_of(seed)["forecasts"], requested)
     for name in requested:
         suffix = f"_{name.replace('/', '.')}" if sites else ""
@@ -161,19 +163,19 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
         for group in (HELD_OUT, known_inputs.FORECAST):
             groups.pop(f"{group}{suffix}", None)
         groups |= {f"{group}{suffix}": dataset for group, dataset in new.items()}
-    return arviz_data.build(groups, arviz_data.attributes(result))
+    return arviz_data.build(groups, view.attrs)
 
 
-def _inputs_by_name(result: Result, inputs: Mapping[str, Any] | Data | None, numpyro_model: Callable,
-                    clock: tuple[str | None, str]) -> dict[str, Any]:
+def _inputs_by_name(view: ResultView, inputs: Mapping[str, Any] | Data | None,
+                    numpyro_model: Callable) -> dict[str, Any]:
     """Return later known inputs and keyword arguments by name, with tables of data on the clock of the fit.
 
     Raises:
         ValueError: neither the result nor the model has an input of this name.
     """
     if isinstance(inputs, Data):
-        inputs = on_clock_of_fit(inputs, *clock, "inputs").inputs
-    stored = known_inputs.inputs_of(result)
+        inputs = on_clock_of_fit(inputs, *view.clock, "inputs").inputs
+    stored = view.inputs
     arguments = _arguments(numpyro_model)
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in arguments.values())
     for name in inputs or {}:
@@ -185,14 +187,14 @@ def _inputs_by_name(result: Result, inputs: Mapping[str, Any] | Data | None, num
     return dict(inputs or {})
 
 
-def _check_events(result: Result, events: Sequence[Event], numpyro_model: Callable) -> None:
+def _check_events(view: ResultView, events: Sequence[Event], numpyro_model: Callable) -> None:
     """Raise ValueError unless events come after the last observation of one series, and the model takes them."""
-    if series_dimension(result) is not None:
+    if view.series_dimension is not None:
         raise ValueError("events: each series of a panel has doses of its own; give inputs={'NAME of series LABEL': "
                          "(times, amounts, 'dose:STATE')}, which continue the data's.")
     if "events" not in _arguments(numpyro_model):
         raise ValueError("events: the model has no argument `events` to take them by.")
-    _, last = rebuilding.observed_span(result)
+    _, last = rebuilding.observed_span(view)
     for event in events:
         if not isinstance(event, Event):
             raise TypeError(f"events must be lfm.Dose, lfm.Infusion or lfm.Reset, got {type(event).__name__}.")
@@ -209,15 +211,15 @@ def _arguments(numpyro_model: Callable) -> dict[str, inspect.Parameter]:
     return rebuilding.further_parameters(numpyro_model)
 
 
-def _continued_rows(later: Mapping[str, Any], model_kwargs: Mapping[str, Any], result: Result,
+def _continued_rows(later: Mapping[str, Any], model_kwargs: Mapping[str, Any], view: ResultView,
                     times: np.ndarray) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return later arguments without rows, and the arguments whose later rows follow the fit's.
 
     An argument has rows if its array in ``model_kwargs`` has one for each row of the data, (T, ...), or of a panel
     (B, T, ...). The later array then has one for each of ``times`` (K,) or (B, K).
     """
-    _, y = rebuilding.observations(result)
-    stored, rows = known_inputs.inputs_of(result), y.shape[:-1]
+    _, y = rebuilding.observations(view)
+    stored, rows = view.inputs, y.shape[:-1]
     arguments, continued = dict(later), {}
     for name, value in later.items():
         earlier: Any = model_kwargs.get(name)
@@ -234,13 +236,13 @@ def _continued_rows(later: Mapping[str, Any], model_kwargs: Mapping[str, Any], r
     return arguments, continued
 
 
-def _with_later_rows(result: Result, later_times: np.ndarray) -> dict[str, np.ndarray]:
+def _with_later_rows(view: ResultView, later_times: np.ndarray) -> dict[str, np.ndarray]:
     """Return times and observations of a result of one site, followed by rows without observations.
 
     Raises:
         ValueError: a later time is not after the data.
     """
-    times, y = rebuilding.observations(result)
+    times, y = rebuilding.observations(view)
     later = np.broadcast_to(later_times, (*times.shape[:-1], later_times.shape[-1]))
     if (later[..., :1] < times[..., -1:]).any():
         raise ValueError(f"times: later rows of arguments are for times after the data, which "
@@ -249,24 +251,23 @@ def _with_later_rows(result: Result, later_times: np.ndarray) -> dict[str, np.nd
     return {"times": np.concatenate([times, later], axis=-1), "y": np.concatenate([y, missing], axis=-2)}
 
 
-def _forecast_selected(result: Result, numpyro_model: Callable, times: Times, inputs: Mapping[str, Any] | Data | None,
-                       options: Mapping[str, Any]) -> Result:
+def _forecast_selected(view: ResultView, numpyro_model: Callable, times: Times,
+                       inputs: Mapping[str, Any] | Data | None, options: Mapping[str, Any]) -> Result:
     """Return a selected series or site with its forecast by the model of the panel or of all sites."""
-    if is_selected_series(result):
-        panel, label = panel_of(result)
-        later = _inputs_by_name(result, inputs, numpyro_model, known_inputs.clock_of(result))
-        predicted = select_series(forecast(panel, numpyro_model, times, inputs=of_all_series(result, later), **options),
-                              label)
+    if SELECTED_SERIES in view.attrs:
+        panel, label = panel_of(view)
+        later = of_all_series(view, _inputs_by_name(view, inputs, numpyro_model))
+        ahead = forecast(panel, numpyro_model, times, inputs=later, **options)
+        predicted = series_view(ResultView.of(ahead), label)
     else:
-        result_of_all, name = all_sites_of(result)
+        all_sites, name = all_sites_of(view)
         options = {**options, "events": {name: options["events"]}}
-        predicted = select_site(
-            forecast(result_of_all, numpyro_model, {name: times}, inputs={name: inputs}, **options), name)
-    groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)
-              if name not in (GROUP, HELD_OUT, known_inputs.FORECAST)}
-    groups |= {name: arviz_data.group(predicted, name) for name in (GROUP, known_inputs.FORECAST)
-               if arviz_data.has_group(predicted, name)}
-    return arviz_data.build(groups, arviz_data.attributes(result))
+        ahead = forecast(all_sites, numpyro_model, {name: times}, inputs={name: inputs}, **options)
+        predicted = site_view(ResultView.of(ahead), name)
+    new = (GROUP, known_inputs.FORECAST)
+    groups = {name: dataset for name, dataset in view.groups.items() if name not in (*new, HELD_OUT)}
+    groups |= {name: predicted.groups[name] for name in new if name in predicted.groups}
+    return arviz_data.build(groups, view.attrs)
 
 
 def _checked(times: Any) -> np.ndarray:
@@ -276,15 +277,15 @@ def _checked(times: Any) -> np.ndarray:
     return checks.time_vector("times", times, order="non-decreasing")
 
 
-def _forecast(key: jax.Array, result: Any, problem: LikelihoodProblem, times: np.ndarray,
+def _forecast(key: jax.Array, view: ResultView, problem: LikelihoodProblem, times: np.ndarray,
               draws: int, progress: bool, has_rows: bool) -> dict[str, xr.Dataset]:
     """Return the groups of a forecast of one site; ``has_rows`` if the last rows of the data have these times."""
     bound = problem.bound
     check_possible(bound, times, has_rows)
-    posterior = arviz_data.group(result, "posterior")
+    posterior = view.posterior
     chains = posterior.sizes["chain"]
     draw_index, rows = evenly_spaced(chains, posterior.sizes["draw"], draws)
-    attrs = arviz_data.attributes(result)
+    attrs = view.attrs
     settings = None
     if str(attrs.get("sampler", "")).startswith("pmmh") and "particles" in attrs:
         settings = ParticleSettings(int(attrs["particles"]))
@@ -298,9 +299,8 @@ def _forecast(key: jax.Array, result: Any, problem: LikelihoodProblem, times: np
     # The log likelihood of an observation family depends on the times of the forecast in its last digits.
     if log_likelihood is not None and not bound.site.example.is_family:
         total = log_likelihood.reshape(chains, len(draw_index), -1).sum(axis=-1)
-        rebuilding.check_likelihood(result, total, draw_index)
-    observed = arviz_data.group(result, "data")
-    series = series_dimension(result)
+        rebuilding.check_likelihood(view, total, draw_index)
+    observed, series = view.group("data"), view.series_dimension
     names = {str(name): observed[name].values.tolist() for name in ("output", series) if name in observed.coords}
     return {GROUP: predictions(bound, split, posterior["draw"].values[draw_index], times, names, series)}
 

@@ -6,6 +6,7 @@ import pytest
 
 from lfm_ppl.accuracy.report import AccuracyReport
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.result_view import ResultView
 
 
 def test_check_prints_stores_and_draws(run, fitted):
@@ -18,9 +19,9 @@ def test_check_prints_stores_and_draws(run, fitted):
         assert f"wrote    {fitted / name}" in out
     assert f"lfm-ppl check {fitted} --draws 40</pre>" in (fitted / "report.html").read_text()
     after = arviz_data.load(fitted)
-    assert set(arviz_data.groups(after)) == {*arviz_data.groups(before), "accuracy"}
-    for name in arviz_data.groups(before):
-        assert arviz_data.group(after, name).identical(arviz_data.group(before, name)), "nothing is lost"
+    assert set(ResultView.of(after).groups) == {*ResultView.of(before).groups, "accuracy"}
+    for name in ResultView.of(before).groups:
+        assert ResultView.of(after).group(name).identical(ResultView.of(before).group(name)), "nothing is lost"
     report = AccuracyReport.of(after)
     assert report.log_ratio.shape == (2, 20)
     table = pd.read_csv(fitted / "accuracy.csv", index_col="parameter")
@@ -35,10 +36,11 @@ def test_check_prints_stores_and_draws(run, fitted):
 def test_new_chains_follow_a_check_that_requires_them(run, well, fitted, monkeypatch):
     assert run(f"check {fitted} --draws 40 --quiet")[0] == 0
     result = arviz_data.load(fitted)
-    report = arviz_data.group(result, "accuracy").assign_attrs(pareto_k=0.9, command="lfm-ppl check RESULT --correct")
+    accuracy = ResultView.of(result).group("accuracy")
+    report = accuracy.assign_attrs(pareto_k=0.9, command="lfm-ppl check RESULT --correct")
     arviz_data.save(arviz_data.add_group(result, "accuracy", report), fitted / "posterior.nc", overwrite=True)
     reports = []
-    monkeypatch.setattr("lfm_ppl.cli.check._correct", lambda task, report, *rest: reports.append(report) or 0)
+    monkeypatch.setattr("lfm_ppl.cli.check._correct", lambda *arguments: reports.append(arguments[2]) or 0)
     monkeypatch.setattr("lfm_ppl.cli.check.check_accuracy", lambda *rest, **keywords: pytest.fail("checked again"))
     status, out, err = run(f"check {fitted} --correct")
     assert status == 0 and reports[0].k == 0.9, err
@@ -59,10 +61,10 @@ def test_correct_writes_a_result_of_its_own(run, fitted):
     assert status == 0, err
     report = AccuracyReport.of(arviz_data.load(fitted))
     corrected = arviz_data.load(fitted / "better")
-    attributes = arviz_data.attributes(corrected)
+    attributes = ResultView.of(corrected).attrs
     assert attributes["sampler"] == ("ram + importance resampling" if report.reliable else "pmmh")
-    assert arviz_data.group(corrected, "posterior")["depth"].shape == (2, 100)
-    assert arviz_data.has_group(corrected, "truth") and (fitted / "better" / "report.html").is_file()
+    assert ResultView.of(corrected).posterior["depth"].shape == (2, 100)
+    assert "truth" in ResultView.of(corrected).groups and (fitted / "better" / "report.html").is_file()
     status, _, err = run(f"check {fitted / 'better'}")
     assert status == 2 and "exact posterior already" in err
 
@@ -74,10 +76,10 @@ def test_exact_chains_where_the_weights_are_not_reliable(run, fitted, monkeypatc
     status, out, err = run(f"check {fitted} --draws 20 --correct --particles 100 --reference particles {flag}")
     assert status == 0, err
     corrected = arviz_data.load(fitted / "corrected")
-    attributes = arviz_data.attributes(corrected)
+    attributes = ResultView.of(corrected).attrs
     assert (attributes["sampler"], attributes["particles"], attributes["steps"]) == ("pmmh", 100, 12)
     assert attributes["delayed"] == bool(flag) and attributes["options"] == '{"noise": 0.25}'
-    assert arviz_data.group(corrected, "posterior")["depth"].shape == (2, 100)
+    assert ResultView.of(corrected).posterior["depth"].shape == (2, 100)
 
 
 @pytest.mark.parametrize(("line", "words"), [
@@ -98,8 +100,8 @@ def test_mistakes_are_one_line(run, well, fitted, tmp_path, line, words):
 
 def test_a_result_without_its_model_file(run, fitted):
     result = arviz_data.load(fitted)
-    attributes = {name: value for name, value in arviz_data.attributes(result).items() if name != "model_file"}
-    groups = {name: arviz_data.group(result, name) for name in arviz_data.groups(result)}
+    attributes = {name: value for name, value in ResultView.of(result).attrs.items() if name != "model_file"}
+    groups = {name: ResultView.of(result).group(name) for name in ResultView.of(result).groups}
     arviz_data.save(arviz_data.build(groups, attributes), fitted / "posterior.nc", overwrite=True)
     status, _, err = run(f"check {fitted}")
     assert status == 2 and "--model FILE" in err

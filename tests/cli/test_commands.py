@@ -16,6 +16,7 @@ from lfm_ppl import cli
 from lfm_ppl.cli import choices, folders, main
 from lfm_ppl.io import loading
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.studies import catalogue
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -84,7 +85,7 @@ def test_a_new_model_is_described_and_fitted_at_once(run):
     assert run("models my_model.py")[0] == 0
     status, out, err = run("fit my_model.py --sampler map --samples 50 --set noise_sd=0.3 --quiet --out result")
     assert status == 0 and "fixed    noise_sd = 0.3" in out, err
-    posterior = arviz_data.group(arviz_data.load("result"), "posterior")
+    posterior = ResultView.of(arviz_data.load("result")).posterior
     assert set(posterior.data_vars) == {"loss", "scale", "lengthscale", "half_life"}
     np.testing.assert_allclose(posterior["half_life"], np.log(2) / posterior["loss"])
     # The truth is 0.3; the prior's own width is 0.5 in the logarithm.
@@ -97,8 +98,8 @@ def test_a_new_model_is_described_and_fitted_at_once(run):
 def test_fit_writes_posterior_summary_figures_and_page(original):
     assert {path.name for path in original.iterdir()} >= {"posterior.nc", "summary.csv", "report.html", *FIGURES}
     posterior = arviz_data.load(original)
-    attributes, draws = arviz_data.attributes(posterior), arviz_data.group(posterior, "posterior")
-    assert draws["depth"].shape == (2, 100) and arviz_data.has_group(posterior, "truth")
+    attributes, draws = ResultView.of(posterior).attrs, ResultView.of(posterior).posterior
+    assert draws["depth"].shape == (2, 100) and "truth" in ResultView.of(posterior).groups
     assert [attributes[name] for name in ("model", "sampler", "seed", "steps")] == ["well", "ram", 1, 12]
     assert json.loads(attributes["options"]) == {"noise": 0.25}
     table = pd.read_csv(original / "summary.csv", index_col="parameter")
@@ -115,7 +116,7 @@ def test_simulated_files_can_be_fitted(run, well, tmp_path):
     status, out, err = run(f"{command} --sampler map --samples 20 --rule unscented --quiet --out r")
     assert status == 0, err
     assert "d.csv: 6 rows of x; 1 values missing" in out and "noise = 0.2" in out
-    assert float(arviz_data.group(arviz_data.load("r"), "truth")["depth"]) == 1.0
+    assert float(ResultView.of(arviz_data.load("r")).group("truth")["depth"]) == 1.0
     assert run(f"simulate {well} --out d.csv")[0] == 2
 
 

@@ -9,6 +9,7 @@ import lfm_ppl as lfm
 from lfm_ppl.io.data import write_csv
 from lfm_ppl.io.loading import load
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.result_view import ResultView
 
 MODEL = '''"""A drug in the blood."""
 import jax.numpy as jnp
@@ -65,7 +66,7 @@ def test_doses_of_a_file_reach_the_fit_and_the_forecast(files, run):
     # The rows after the data repeat the doses of the last interval, so that the forecast must rise after the dose.
     status, _, errors = run(f"forecast out --held-out {files}/later.csv --events AMT:gut --out ahead --draws 20")
     assert status == 0, errors
-    stored = arviz_data.group(arviz_data.load("ahead"), "predictions")["y"].mean(("chain", "draw", "output"))
+    stored = ResultView.of(arviz_data.load("ahead")).group("predictions")["y"].mean(("chain", "draw", "output"))
     assert stored.sel(time=14.0) > 2.0 > stored.sel(time=12.0)
     assert "forecast-inputs.png" in {path.name for path in (files / "ahead").iterdir()}
 
@@ -104,21 +105,21 @@ def test_subjects_of_a_file_are_fitted_together_with_their_doses(files, run):
                             "--sampler map --samples 20 --out panel")
     assert status == 0, errors
     result = arviz_data.load("panel")
-    doses = arviz_data.group(result, "constant_data")
+    doses = ResultView.of(result).group("constant_data")
     assert doses["AMT of series Ann"].values.tolist() == [4.0] and doses["AMT of series Bo"].values.tolist() == [4.0]
-    assert "trajectories" in arviz_data.groups(result)
-    assert list(arviz_data.group(lfm.select_series(result, "Ann"), "constant_data")) == ["AMT"]
+    assert "trajectories" in ResultView.of(result).groups
+    assert list(ResultView.of(lfm.select_series(result, "Ann")).group("constant_data")) == ["AMT"]
     # Bo alone, whose rows begin later, with a further dose; the panel with the doses of both.
     lfm.save(lfm.select_series(result, "Bo"), files / "bo")
     status, _, errors = run(f"forecast bo --held-out {files}/later.csv --events AMT:gut --draws 10 --out ahead")
     assert status == 0, errors
     ahead = arviz_data.load("ahead")
-    alone = arviz_data.group(ahead, "predictions")["outputs"][..., 0]
+    alone = ResultView.of(ahead).group("predictions")["outputs"][..., 0]
     assert alone.dims == ("chain", "draw", "time") and alone["time"].values.tolist() == [12.0, 14.0]
-    assert arviz_data.group(ahead, "predictions_constant_data")["AMT"].values.tolist()[-2:] == [4.0, 4.0]
+    assert ResultView.of(ahead).group("predictions_constant_data")["AMT"].values.tolist()[-2:] == [4.0, 4.0]
     again = lfm.forecast(lfm.select_series(result, "Bo"), load(str(files / "panel.py")).model, [12.0, 14.0], draws=10,
                          inputs={"AMT": ([8.0, 12.0], [4.0, 4.0], "dose:gut")}, progress=False)
-    np.testing.assert_allclose(arviz_data.group(again, "predictions")["outputs"][..., 0], alone)
-    rate = float(arviz_data.group(lfm.select_series(result, "Bo"), "posterior")["ke"][0, 0])
+    np.testing.assert_allclose(ResultView.of(again).group("predictions")["outputs"][..., 0], alone)
+    rate = float(ResultView.of(lfm.select_series(result, "Bo")).posterior["ke"][0, 0])
     expected = sum(4 * 1.3 / (1.3 - rate) * (np.exp(-rate * gap) - np.exp(-1.3 * gap)) for gap in (6.0, 2.0))
     assert float(alone[0, 0, 1]) == pytest.approx(expected, rel=1e-6)

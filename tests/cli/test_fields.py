@@ -3,7 +3,7 @@
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl.results.arviz_data import groups
+from lfm_ppl.results.result_view import ResultView
 
 ROD = '''"""Heat in a rod."""
 import jax
@@ -39,7 +39,7 @@ def test_fields_are_stored_and_drawn_again(run, tmp_path):
     (tmp_path / "rod.py").write_text(ROD)
     status, output, errors = run("fit ./rod.py --sampler map --samples 20 --out rod --quiet")
     assert status == 0, errors
-    assert "field-source.png" in output and "field_source" in groups(lfm.load("rod"))
+    assert "field-source.png" in output and "field_source" in ResultView.of(lfm.load("rod")).groups
     assert "field-source" in (tmp_path / "rod" / "report.html").read_text()
     assert run("plot rod --out again")[0] == 0 and (tmp_path / "again" / "field-source.png").is_file()
 

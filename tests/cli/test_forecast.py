@@ -6,10 +6,11 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.result_view import ResultView
 
 
 def test_fit_until_and_at_stores_predictions_with_their_noise(original):
-    result = arviz_data.group(arviz_data.load(original), "predictions")
+    result = ResultView.of(arviz_data.load(original)).group("predictions")
     assert {0.0, 5.0, 6.25, 8.0} <= set(result["time"].values.tolist())
     assert result["y"].dims == ("chain", "draw", "time", "output")
     np.testing.assert_allclose(result["y_sd"], np.hypot(0.25, result["outputs_sd"]))
@@ -28,7 +29,7 @@ def test_a_forecast_writes_table_figures_group_and_scores(run, fitted, tmp_path)
     assert {path.name for path in ahead.iterdir()} == {
         "posterior.nc", "forecast.csv", "forecast.png", "forecast-states.png", "scores.csv", "report.html"}
     stored = arviz_data.load(ahead)
-    later = arviz_data.group(stored, "held_out_data")["y"]
+    later = ResultView.of(stored).group("held_out_data")["y"]
     np.testing.assert_array_equal(later.sel(output="x"), [-0.9, np.nan, -1.2])
     table = pd.read_csv(ahead / "forecast.csv")
     assert table["time"].tolist() == [6.0, 7.0, 7.5] and (table["q97.5"] > table["noise_free_q97.5"]).all()
@@ -39,26 +40,26 @@ def test_a_forecast_writes_table_figures_group_and_scores(run, fitted, tmp_path)
     assert f"lfm-ppl forecast {fitted} --held-out" in page and page.count("data:image/png;base64,") == 2
     assert run(f"forecast {ahead} --until 8 --draws 30 --overwrite")[0] == 0
     assert pd.read_csv(ahead / "forecast.csv")["time"].tolist() == [6.0, 7.0, 8.0]  # at the spacing of the data
-    assert "held_out_data" not in arviz_data.groups(arviz_data.load(ahead))
+    assert "held_out_data" not in ResultView.of(arviz_data.load(ahead)).groups
 
 
 def test_predictions_are_replaced_only_with_overwrite(run, fitted):
-    before = arviz_data.group(arviz_data.load(fitted), "predictions")
+    before = ResultView.of(arviz_data.load(fitted)).group("predictions")
     status, _, err = run(f"forecast {fitted} --at 9")
     assert status == 2 and "already holds predictions" in err and not (fitted / "forecast.csv").exists()
-    assert arviz_data.group(arviz_data.load(fitted), "predictions").equals(before)
+    assert ResultView.of(arviz_data.load(fitted)).group("predictions").equals(before)
     status, _, err = run(f"forecast {fitted} --at 6,7,7.5 --overwrite --draws 30")
     assert status == 0, err
     after = arviz_data.load(fitted)
-    assert arviz_data.group(after, "predictions")["time"].values.tolist() == [6.0, 7.0, 7.5]
-    assert arviz_data.has_group(after, "trajectories")
+    assert ResultView.of(after).group("predictions")["time"].values.tolist() == [6.0, 7.0, 7.5]
+    assert "trajectories" in ResultView.of(after).groups
 
 
 @pytest.mark.slow
 def test_a_forecast_of_a_partial_result_has_its_figure(run, fitted):
     result = arviz_data.load(fitted)
-    partial = arviz_data.build({name: arviz_data.group(result, name) for name in ("posterior", "data")},
-                               {**arviz_data.attributes(result), "partial": "60 of 90 draws a chain"})
+    partial = arviz_data.build({name: ResultView.of(result).group(name) for name in ("posterior", "data")},
+                               {**ResultView.of(result).attrs, "partial": "60 of 90 draws a chain"})
     arviz_data.save(partial, fitted / "posterior.nc", overwrite=True)
     status, out, err = run(f"forecast {fitted} --until 8")
     assert status == 0 and f"wrote    {fitted / 'forecast.png'}" in out, err

@@ -19,6 +19,7 @@ from lfm_ppl.cli import main
 from lfm_ppl.constrained.augmented import COARSE, build_rows
 from lfm_ppl.inference.factor_failures import failures_at, path_ess
 from lfm_ppl.results import arviz_data, convergence, tables
+from lfm_ppl.results.result_view import ResultView
 
 TIMES = np.linspace(0.0, 3.0, 4)
 Y = np.array([[0.0], [0.1], [0.02], [0.1]])
@@ -111,7 +112,7 @@ def test_a_fit_stores_and_says_it(tmp_path):
     with pytest.warns(lfm.ConvergenceWarning, match="16 weighted trajectories"):
         result = lfm.fit(lambda times, y=None: bounded(times, y, 16, 31), TIMES, Y, sampler="ram", chains=2, warmup=50,
                          samples=50, trajectory_draws=0, progress=False)
-    attrs = arviz_data.attributes(result)
+    attrs = ResultView.of(result).attrs
     assert attrs["constraints"] == "factor >= 0 at 31 times" and json.loads(attrs["factor_failures"])[0] == 100
     assert any("weighted trajectories" in warning for warning in json.loads(attrs["warnings"]))
 
@@ -144,7 +145,7 @@ def test_the_command_line_chooses_the_times(tmp_path, monkeypatch, capsys):
                  "--samples", "40", "--out", "out", "--quiet", "--no-cache"]) == 0
     assert "factor >= 0 at 7 times" in capsys.readouterr().out
     result = lfm.load("out")
-    attrs = arviz_data.attributes(result)
+    attrs = ResultView.of(result).attrs
     assert attrs["constraints"] == "factor >= 0 at 7 times" and json.loads(attrs["factor_failures"]) == [40, 0, 0]
     trajectories, median, _ = json.loads(attrs["constraint_weights"])
     assert trajectories == 256 and median > 10 and not arviz_data.convergence_warnings(result)

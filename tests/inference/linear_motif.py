@@ -40,7 +40,8 @@ def build(decay, lengthscale, noise_sd) -> lfm.LatentForceModel:
 
 def model(times, y=None, spread=0.4) -> None:
     """The NumPyro model; ``spread`` is the width of the priors around THETA."""
-    decay = numpyro.sample("decay", dist.LogNormal(jnp.log(THETA["decay"]), spread).to_event(1))
+    decay = numpyro.sample("decay", dist.LogNormal(jnp.log(THETA["decay"]), spread).to_event(1),
+                           infer={"event_dims": ["output"]})
     lengthscale = numpyro.sample("lengthscale", dist.LogNormal(jnp.log(THETA["lengthscale"]), spread))
     noise_sd = numpyro.sample("noise_sd", dist.LogNormal(jnp.log(THETA["noise_sd"]), spread))
     numpyro.sample("y", lfm.MarginalLikelihood(build(decay, lengthscale, noise_sd), times), obs=y)

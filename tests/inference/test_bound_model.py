@@ -25,7 +25,7 @@ from lfm_ppl.inference.laplace_start import Laplace
 from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.inference.trace import SharedModel
-from lfm_ppl.results.arviz_data import group
+from lfm_ppl.results.result_view import ResultView
 from tests.compiled_programs import compilations
 
 TIMES = np.array([0.0, 0.7, 1.1, 2.0, 3.0])
@@ -162,7 +162,7 @@ def test_a_second_data_set_compiles_nothing(sampler, model):
     with compilations() as compiled:
         result = compute(OTHER)
     assert compiled == []
-    np.testing.assert_array_equal(group(result, "data")["y"].values, OTHER)
+    np.testing.assert_array_equal(ResultView.of(result).group("data")["y"].values, OTHER)
 
 
 @pytest.mark.slow

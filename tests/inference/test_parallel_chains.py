@@ -30,7 +30,7 @@ for method in ("sequential", "parallel"):
         result = lfm.fit(model, np.arange(3.0), y, sampler="ram", chains=2, warmup=400, samples=400, thin=1,
                          trajectory_draws=0, progress=False, chain_method=method,
                          sampler_options={"initial_covariance": 0.1 * np.eye(1)})
-    draws.append(np.asarray(lfm.results.arviz_data.group(result, "posterior")["decay"]))
+    draws.append(np.asarray(result["posterior"]["decay"]))
 blocks = [name for name in compiled if "jit(advance_on_device)" in name]
 assert len(blocks) == 1, blocks
 np.testing.assert_allclose(*draws, rtol=1e-6)

@@ -16,7 +16,8 @@ from lfm_ppl.inference.kernels.robust_metropolis import Adaptation, initial_stat
 from lfm_ppl.inference.particle_potential import ParticlePotential
 from lfm_ppl.inference.trajectories import trajectories
 from lfm_ppl.particles.particle_filter import ParticleSettings
-from lfm_ppl.results.arviz_data import group, summary
+from lfm_ppl.results.arviz_data import summary
+from lfm_ppl.results.result_view import ResultView
 
 TIMES = np.array([0.0, 0.6, 1.5, 1.5, 2.7, 4.0])
 Y = np.array([[1.2], [0.7], [np.nan], [0.5], [-0.2], [0.4]])
@@ -143,12 +144,12 @@ def test_a_panel():
 def test_fit_samples_and_reports_the_particles():
     result = lfm.fit(relaxing, TIMES, Y, sampler="pmmh", chains=2, warmup=100, samples=200, thin=5, progress=False,
                      trajectory_draws=20, chain_method="vectorized")
-    log_rate = np.log(group(result, "posterior")["rate"].values)
+    log_rate = np.log(ResultView.of(result).posterior["rate"].values)
     mean, sd = exact_posterior()
     assert abs(log_rate.mean() - mean) < 5.0 * sd / np.sqrt(summary(result)["ess_bulk"].iloc[0])
     assert result.attrs["sampler"] == "pmmh" and result.attrs["particles"] >= 50
     assert 0.0 < result.attrs["log_likelihood_sd"] < 1.6
-    assert set(group(result, "sample_stats")) == {"acceptance_rate", "accepted", "lp", "estimated"}
+    assert set(ResultView.of(result).group("sample_stats")) == {"acceptance_rate", "accepted", "lp", "estimated"}
 
 
 @pytest.mark.slow

@@ -16,8 +16,7 @@ from lfm_ppl.cli.options import Columns
 from lfm_ppl.io.data import read_csv, read_series
 from lfm_ppl.io.data_set import Data, InputTable, continued_inputs, stack_series
 from lfm_ppl.io.loading import load
-from lfm_ppl.results.arviz_data import build
-from lfm_ppl.results.inputs import GROUP, inputs_of, to_dataset
+from lfm_ppl.results.inputs import from_dataset, to_dataset
 
 ABSORPTION, ELIMINATION = 0.3, 0.1
 RATES = np.array([[-ABSORPTION, 0.0], [ABSORPTION, -ELIMINATION]])
@@ -103,7 +102,7 @@ def test_a_dosing_file_is_the_history_that_it_describes(seed, read):
     np.testing.assert_array_equal(np.isnan(data.y[:, 0]), unobserved)
     np.testing.assert_allclose(predicted(data), simulate(data.times, doses, resets), atol=1e-8)
     # Stored with a result, and read back.
-    stored = inputs_of(build({GROUP: to_dataset(data.inputs)}))["AMT"]
+    stored = from_dataset(to_dataset(data.inputs))["AMT"]
     for loaded, original in zip(stored, data.inputs["AMT"], strict=True):
         np.testing.assert_array_equal(loaded, original)
 

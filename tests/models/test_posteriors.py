@@ -7,7 +7,8 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.io import loading
-from lfm_ppl.results.arviz_data import group, groups, summary
+from lfm_ppl.results.arviz_data import summary
+from lfm_ppl.results.result_view import ResultView
 
 RANDOM_WALKS = [(name, {"sampler": "ram", "warmup": 1000, "samples": 1000})
                 for name in ("ginzburg-landau", "transcription", "spring")]
@@ -22,12 +23,12 @@ def test_chains_converge_and_cover_the_truth(name, options):
         warnings.simplefilter("error", lfm.ConvergenceWarning)
         result = lfm.fit(file.model, data.times, data.y, model_kwargs=file.keywords(data, {}), truth=data.truth,
                          progress=False, **options)
-    table = summary(result)
+    view, table = ResultView.of(result), summary(result)
     assert table["r_hat"].max() <= 1.01 and table["ess_bulk"].min() >= 400
-    assert options or float(group(result, "sample_stats")["diverging"].mean()) < 0.005
-    for name in {"log_likelihood", "posterior_predictive", "trajectories"} & set(groups(result)):
-        assert all(np.isfinite(variable).all() for variable in group(result, name).data_vars.values()), name
-    posterior, truth = group(result, "posterior"), group(result, "truth")
+    assert options or float(view.group("sample_stats")["diverging"].mean()) < 0.005
+    for name in {"log_likelihood", "posterior_predictive", "trajectories"} & set(view.groups):
+        assert all(np.isfinite(variable).all() for variable in view.group(name).data_vars.values()), name
+    posterior, truth = view.posterior, view.group("truth")
     ranks = []
     for parameter in file.parameters:
         draws = posterior[parameter].stack(sample=("chain", "draw"))

@@ -15,7 +15,8 @@ import lfm_ppl as lfm
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.optimise import newton, quasi_newton
 from lfm_ppl.io import loading
-from lfm_ppl.results.arviz_data import group, summary
+from lfm_ppl.results.arviz_data import summary
+from lfm_ppl.results.result_view import ResultView
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 P53 = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data")) / "p53" / "p53_targets.csv"
@@ -133,7 +134,7 @@ def test_p53_posterior(file):
     # 20 parameters: |z| < 4 for all of them holds with probability 0.999
     assert z.abs().max() < 4.0, z.round(1).to_dict()
 
-    forces = group(nuts, "trajectories")["forces"].isel(force=0)
+    forces = ResultView.of(nuts).group("trajectories")["forces"].isel(force=0)
     peak = forces["at"].values[forces.mean(["chain", "draw"]).values.argmax()]
     assert peak < 6.0
     each = forces["at"].values[forces.values.argmax(axis=forces.dims.index("at"))]

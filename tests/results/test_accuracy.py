@@ -19,6 +19,7 @@ from lfm_ppl.accuracy.report import AccuracyReport
 from lfm_ppl.accuracy.verdict import Findings, judge
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.plots import plot_accuracy
+from lfm_ppl.results.result_view import ResultView
 
 TIMES = np.arange(6.0)
 Y = np.array([[0.9], [1.1], [np.nan], [0.8], [1.2], [0.7]])
@@ -223,9 +224,9 @@ def test_ratios_of_a_linear_model_are_zero_up_to_the_noise_of_particles(linear):
 @pytest.mark.slow
 def test_particles_and_grid_agree(bent):
     result, exact = bent, check_accuracy(bent, well, draws=400, progress=False)
-    copy = arviz_data.build({"posterior": arviz_data.group(result, "posterior"),
-                             "data": arviz_data.group(result, "data")},
-                            arviz_data.attributes(result))
+    copy = arviz_data.build({"posterior": ResultView.of(result).posterior,
+                             "data": ResultView.of(result).group("data")},
+                            ResultView.of(result).attrs)
     noisy = check_accuracy(copy, well, reference="particles", draws=400, particles=300, progress=False)
     np.testing.assert_array_equal(noisy.dataset["draw"], exact.dataset["draw"])
     difference = noisy.log_ratio - exact.log_ratio
@@ -242,7 +243,7 @@ def test_particles_and_grid_agree(bent):
 def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     """Importance weights from draws of the wrong posterior against quadrature with the exact likelihood."""
     single_pass = lfm.approximate(well, iterations=0)
-    result = arviz_data.build({name: arviz_data.group(bent, name) for name in ("posterior", "data")}, {})
+    result = arviz_data.build({name: ResultView.of(bent).group(name) for name in ("posterior", "data")}, {})
     problem = rebuilding.problem(result, single_pass)
     nodes = np.linspace(0.15, 5.0, 60)
     posteriors = {}
@@ -259,7 +260,7 @@ def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     cumulative = np.cumsum(posteriors["wrong"][0]) - 0.5 * posteriors["wrong"][0]
     draws = np.interp(np.random.default_rng(0).uniform(size=(4, 100)), cumulative, nodes)
     replaced = arviz_data.build({"posterior": xr.Dataset({"depth": (("chain", "draw"), draws)}),
-                                 "data": arviz_data.group(result, "data")}, {"sampler": "nuts"})
+                                 "data": ResultView.of(result).group("data")}, {"sampler": "nuts"})
     report = check_accuracy(replaced, single_pass, draws=400, progress=False)
     row = report.table.loc["depth"]
     assert report.reliable
@@ -268,10 +269,10 @@ def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     assert abs(row["corrected_sd"] / row["sd"] - posteriors["exact"][2] / posteriors["wrong"][2]) \
         < 3.5 * row["sd_ratio_se"] + 0.02
     corrected = correct_posterior(replaced, single_pass)
-    again = arviz_data.group(corrected, "posterior")["depth"].values
+    again = ResultView.of(corrected).posterior["depth"].values
     assert again.shape == (4, 100) and set(again.ravel()) <= set(draws.ravel())
     assert abs(again.mean() - posteriors["exact"][1]) < 4 * posteriors["exact"][2] / np.sqrt(report.ess)
-    assert arviz_data.attributes(corrected)["sampler"] == "nuts + importance resampling"
+    assert ResultView.of(corrected).attrs["sampler"] == "nuts + importance resampling"
 
 
 def test_the_report_survives_the_file(checked, tmp_path):
@@ -308,13 +309,13 @@ def test_correction_keeps_data_truth_and_the_layout_of_trajectories(checked):
     result, report = checked
     assert report.reliable
     corrected = correct_posterior(result, well, trajectory_draws=6)
-    old, new = (arviz_data.group(one, "trajectories") for one in (result, corrected))
+    old, new = (ResultView.of(one).group("trajectories") for one in (result, corrected))
     assert new["states"].dims == old["states"].dims and new["states"].shape == (1, 6, *old["states"].shape[2:])
     np.testing.assert_array_equal(new["at"], old["at"])
-    chains, draws = (arviz_data.group(corrected, "posterior").sizes[name] for name in ("chain", "draw"))
+    chains, draws = (ResultView.of(corrected).posterior.sizes[name] for name in ("chain", "draw"))
     for name in ("log_likelihood", "posterior_predictive"):
-        assert arviz_data.group(corrected, name)["y"].shape[:2] == (chains, draws)
-    assert {"data", "truth"} <= set(arviz_data.groups(corrected))
+        assert ResultView.of(corrected).group(name)["y"].shape[:2] == (chains, draws)
+    assert {"data", "truth"} <= set(ResultView.of(corrected).groups)
     assert "states_summary" in new  # of the corrected draws, where the result has none
 
 
@@ -390,7 +391,7 @@ def test_mistakes(bent, changes, name):
 
 
 def test_mistakes_about_the_result(bent, linear):
-    posterior, observed = (arviz_data.group(bent, name) for name in ("posterior", "data"))
+    posterior, observed = (ResultView.of(bent).group(name) for name in ("posterior", "data"))
     for groups, attrs, model, name in (
             ({}, {}, well, "data"), ({"data": observed}, {}, relaxation, "rate"),
             ({}, {"sampler": "pmmh"}, well, "pmmh"), ({}, {"sampler": "hmc"}, well, "hmc")):
@@ -410,7 +411,7 @@ def test_the_grid_takes_one_state(linear):
             lfm.GaussianObservation(lambda x, u, t: x, jnp.ones(1)), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
-    draws = arviz_data.build({"posterior": arviz_data.group(linear, "posterior")})
+    draws = arviz_data.build({"posterior": ResultView.of(linear).posterior})
     with pytest.raises(ValueError, match="reference"):
         check_accuracy(draws, driven, TIMES, Y, reference="grid")
 

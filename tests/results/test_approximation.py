@@ -11,7 +11,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.forces.sde import ApproximationWarning
-from lfm_ppl.results import arviz_data
+from lfm_ppl.results.result_view import ResultView
 
 # Theophylline, subject 5 of the public data set (Boeckmann, Sheiner and Beal, 1994).
 DOSE = 5.86
@@ -47,7 +47,7 @@ def fit(**settings):
 @pytest.mark.slow
 def test_the_default_likelihood_of_a_positive_force_is_iterated():
     result, messages = fit()
-    attrs = arviz_data.attributes(result)
+    attrs = ResultView.of(result).attrs
     assert attrs["likelihood"] == "approximate (three iterations of posterior linearisation)"
     assert attrs["iterations"] == 3
     assert not any("iterations" in message for message in messages)
@@ -55,7 +55,7 @@ def test_the_default_likelihood_of_a_positive_force_is_iterated():
 
 def test_a_single_pass_is_reported_with_the_cheapest_remedy():
     result, messages = fit(iterations=0)
-    attrs = arviz_data.attributes(result)
+    attrs = ResultView.of(result).attrs
     assert attrs["likelihood"] == "approximate (a single pass of the filter)"
     (message,) = [message for message in messages if "iterations" in message]
     assert "--iterations 3" in message

@@ -13,6 +13,7 @@ from scipy import special, stats
 
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data, netcdf
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.scalars import choose, scalar_draws, scalar_truth, unit_of, units_attribute
 from tests.arviz_checks import IS_DATATREE, check_arviz
 from tests.inference import linear_motif as motif
@@ -28,27 +29,27 @@ def draws_only(draws, name="theta", **groups):
 def test_build_and_groups(result, datasets):
     assert type(result).__name__ == ("DataTree" if IS_DATATREE else "InferenceData")
     for name, dataset in datasets.items():
-        xr.testing.assert_identical(arviz_data.group(result, name), dataset)
-    assert arviz_data.attributes(result)["seed"] == 3
+        xr.testing.assert_identical(ResultView.of(result).group(name), dataset)
+    assert ResultView.of(result).attrs["seed"] == 3
     scoped = xr.Dataset({"gene/decay": (("chain", "draw"), np.ones((2, 4)))})
     built = arviz_data.build({"posterior": scoped, "truth": xr.Dataset()})
-    assert arviz_data.groups(built) == ("posterior",)
-    assert list(arviz_data.group(built, "posterior").data_vars) == ["gene.decay"]
-    for faulty in (lambda: arviz_data.build({"posterior": {}}), lambda: arviz_data.groups({})):
+    assert tuple(ResultView.of(built).groups) == ("posterior",)
+    assert list(ResultView.of(built).posterior.data_vars) == ["gene.decay"]
+    for faulty in (lambda: arviz_data.build({"posterior": {}}), lambda: tuple(ResultView.of({}).groups)):
         with pytest.raises(TypeError):
             faulty()
     with pytest.raises(ValueError, match="trajectories"):
-        arviz_data.group(built, "trajectories")
+        ResultView.of(built).group("trajectories")
 
 
 def test_add_group_adds_and_replaces(result):
     first, second = xr.Dataset({"y": ("time", [1.0, 2.0])}), xr.Dataset({"y": ("time", [3.0])})
-    before = arviz_data.groups(result)
+    before = tuple(ResultView.of(result).groups)
     assert arviz_data.add_group(result, "forecast", first) is result
     arviz_data.add_group(result, "forecast", second)
-    assert arviz_data.groups(result) == (*before, "forecast")
-    xr.testing.assert_identical(arviz_data.group(result, "forecast"), second)
-    assert arviz_data.groups(arviz_data.remove_group(result, "forecast")) == before
+    assert tuple(ResultView.of(result).groups) == (*before, "forecast")
+    xr.testing.assert_identical(ResultView.of(result).group("forecast"), second)
+    assert tuple(ResultView.of(arviz_data.remove_group(result, "forecast")).groups) == before
 
 
 # Files
@@ -59,15 +60,15 @@ def test_round_trip_keeps_everything(tmp_path, result, datasets):
     for place in (path, str(path.parent)):
         loaded = lfm.load(place)
         assert type(loaded) is type(result)
-        assert set(arviz_data.groups(loaded)) == set(datasets)
+        assert set(ResultView.of(loaded).groups) == set(datasets)
         for name, dataset in datasets.items():
-            again = arviz_data.group(loaded, name)
+            again = ResultView.of(loaded).group(name)
             xr.testing.assert_identical(again, dataset)
             assert all(again[variable].dtype == dataset[variable].dtype for variable in dataset.variables)
-        assert arviz_data.attributes(loaded) == arviz_data.attributes(result)
+        assert ResultView.of(loaded).attrs == ResultView.of(result).attrs
     assert os.listdir(path.parent) == ["posterior.nc"]
     by_arviz = az.from_netcdf(path)
-    assert arviz_data.groups(by_arviz) == arviz_data.groups(result)
+    assert tuple(ResultView.of(by_arviz).groups) == tuple(ResultView.of(result).groups)
     assert arviz_data.summary(by_arviz).equals(arviz_data.summary(result))
 
 
@@ -101,9 +102,9 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
     with pytest.raises((TypeError, ValueError)):
         arviz_data.save(arviz_data.build({"posterior": broken}), path, overwrite=True)
     assert os.listdir(tmp_path) == ["posterior.nc"]
-    assert arviz_data.group(arviz_data.load(path), "posterior")["theta"].values.max() == 0.0
+    assert ResultView.of(arviz_data.load(path)).posterior["theta"].values.max() == 0.0
     arviz_data.save(second, path, overwrite=True)
-    assert arviz_data.group(arviz_data.load(path), "posterior")["theta"].values.min() == 1.0
+    assert ResultView.of(arviz_data.load(path)).posterior["theta"].values.min() == 1.0
     with pytest.raises(IsADirectoryError):
         arviz_data.save(first, tmp_path, overwrite=True)
 
@@ -146,7 +147,7 @@ def test_predictive_checks_and_prior_sensitivity_of_a_fit():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lfm.ConvergenceWarning)
         result = lfm.to_arviz(draws, motif.model, motif.TIMES, y, trajectory_draws=30)
-    prior, posterior = arviz_data.group(result, "log_prior"), arviz_data.group(result, "posterior")
+    prior, posterior = ResultView.of(result).group("log_prior"), ResultView.of(result).posterior
     for name, value in motif.THETA.items():
         expected = stats.lognorm.logpdf(posterior[name].values, 0.4, scale=value)
         np.testing.assert_allclose(prior[name].values, expected.sum(-1) if name == "decay" else expected, rtol=1e-6)

@@ -9,7 +9,7 @@ import numpyro.distributions as dist
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl.results.arviz_data import group
+from lfm_ppl.results.result_view import ResultView
 from tests.arviz_checks import check_arviz
 
 TIMES = np.tile(0.3 * np.arange(6.0), (3, 1))
@@ -66,11 +66,12 @@ def test_a_panel_with_padded_rows_and_a_series_without_data():
     for series, rows in ((0, [0, 1, 2, 3]), (1, [0, 1, 3, 4, 5])):
         view = lfm.select_series(result, series)
         check_arviz(view, {"y": len(rows)})
-        np.testing.assert_array_equal(group(view, "observed_data")["time"], TIMES[0, rows])
-        rate = group(result, "posterior")["rate"].values[1, 7, series]
+        np.testing.assert_array_equal(ResultView.of(view).group("observed_data")["time"], TIMES[0, rows])
+        rate = ResultView.of(result).posterior["rate"].values[1, 7, series]
         alone = lfm.smooth(build(rate), TIMES[0, rows], y[series, rows])
-        np.testing.assert_allclose(group(view, "log_likelihood")["y"][1, 7], alone.leave_one_out, rtol=1e-9)
-    assert group(lfm.select_series(result, 2), "observed_data")["y"].size == 0
+        stored = ResultView.of(view).group("log_likelihood")["y"][1, 7]
+        np.testing.assert_allclose(stored, alone.leave_one_out, rtol=1e-9)
+    assert ResultView.of(lfm.select_series(result, 2)).group("observed_data")["y"].size == 0
 
 
 def test_two_sites_of_several_outputs_and_series():
@@ -82,10 +83,10 @@ def test_two_sites_of_several_outputs_and_series():
         view = lfm.select_site(result, site)
         np.testing.assert_array_equal(check_arviz(view, {"y": len(terms)})["y"], terms)
     # Correlated noise: an entry is left out, and the other one of its row is not.
-    rate = group(result, "posterior")["shared"].values[0, 3]
+    rate = ResultView.of(result).posterior["shared"].values[0, 3]
     likelihood, without = lfm.MarginalLikelihood(build(rate, (1.0, 2.0)), TIMES[0]), y["one"].copy()
     without[2, 0] = np.nan
-    left_out = group(lfm.select_site(result, "one"), "log_likelihood")["y"][0, 3]
+    left_out = ResultView.of(lfm.select_site(result, "one")).group("log_likelihood")["y"][0, 3]
     is_entry = (left_out["time"] == TIMES[0, 2]).values & (left_out["output"] == left_out["output"][0]).values
     np.testing.assert_allclose(left_out.values[is_entry], likelihood.log_prob(y["one"]) - likelihood.log_prob(without),
                                atol=1e-9)
@@ -97,10 +98,10 @@ def test_counts_with_missing_entries():
     result = converted(counts, np.arange(8.0), y, {"level": np.log(3.0) + np.log(draws_of())})
     check_arviz(result, {"y": 13})
     for name in ("observed_data", "posterior_predictive"):
-        assert group(result, name)["y"].dtype.kind == "i"
+        assert ResultView.of(result).group(name)["y"].dtype.kind == "i"
     # Each entry alone, also where the other one of its row is present: by quadrature of the evidence.
-    level = group(result, "posterior")["level"].values[0, 0]
-    terms = group(result, "log_likelihood")["y"][0, 0]
+    level = ResultView.of(result).posterior["level"].values[0, 0]
+    terms = ResultView.of(result).group("log_likelihood")["y"][0, 0]
     without = y.copy()
     without[4, 0] = np.nan
 
@@ -124,7 +125,7 @@ def test_replicates_of_a_linear_model_are_the_smoothed_state_and_noise():
     y = Y[1] * np.array([1.0, 2.0])
     y[2], y[4, 0] = np.nan, np.nan
     result = converted(single, TIMES[1], y, {"rate": np.ones((2, 3000))})
-    replicated = group(result, "posterior_predictive")["y"].values.reshape(6000, -1)
+    replicated = ResultView.of(result).group("posterior_predictive")["y"].values.reshape(6000, -1)
     smoothed, gain = lfm.smooth(build(1.0, (1.0, 2.0)), TIMES[1], y), np.array([1.0, 2.0])
     rows, outputs = np.nonzero(np.isfinite(y))
     mean = smoothed.input_mean[rows, 0] * gain[outputs]

@@ -12,7 +12,8 @@ from lfm_ppl.fokker_planck_grid.grid_filter import log_likelihood
 from lfm_ppl.io import loading
 from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 from lfm_ppl.model.state_space import state_space
-from lfm_ppl.results.arviz_data import group, summary
+from lfm_ppl.results.arviz_data import summary
+from lfm_ppl.results.result_view import ResultView
 
 pytestmark = pytest.mark.slow
 
@@ -104,7 +105,7 @@ def test_particle_marginal_chains_find_it(wells, exact, samples, options):
                     sampler_options={"particle_steps": 20, **options})
     table = summary(result)
     assert table.loc[list(NAMES), "ess_bulk"].min() > 100
-    draws = group(result, "posterior")
+    draws = ResultView.of(result).posterior
     for name, (mean, sd) in exact[ELSEWHERE].items():
         row = table.loc[name]
         assert abs(row["mean"] - mean) < 4.0 * row["mcse_mean"], name

@@ -19,6 +19,7 @@ from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.plots.saving import pages_of
 from lfm_ppl.results.predictions import summary
+from lfm_ppl.results.result_view import ResultView
 
 TIMES = np.arange(14.0)
 COUNTS = np.array([2, 0, 1, 3, 5, 4, 7, 3, 2, 1, 0, 0, 1, 2], float)[:, None]
@@ -54,8 +55,8 @@ def ahead(result):
 
 @pytest.mark.slow
 def test_new_counts_are_counts_and_so_are_their_intervals(result, ahead):
-    predicted = arviz_data.group(ahead, "predictions")
-    replicated = arviz_data.group(result, "posterior_predictive")["y"].values
+    predicted = ResultView.of(ahead).group("predictions")
+    replicated = ResultView.of(result).group("posterior_predictive")["y"].values
     for drawn in (predicted["y"].values, replicated):
         assert np.all(drawn == np.round(drawn)) and np.all(drawn >= 0)
     table = summary(predicted)
@@ -64,10 +65,10 @@ def test_new_counts_are_counts_and_so_are_their_intervals(result, ahead):
 
 
 def test_counts_have_residuals(result):
-    residual = arviz_data.group(result, "one_step_ahead")["residual"]
+    residual = ResultView.of(result).group("one_step_ahead")["residual"]
     assert np.all(np.isfinite(residual))
     # The first count, given nothing before it, at the first draw: by quadrature over the force's prior.
-    level, scale = (float(arviz_data.group(result, "posterior")[name][0, 0]) for name in ("level", "scale"))
+    level, scale = (float(ResultView.of(result).posterior[name][0, 0]) for name in ("level", "scale"))
     nodes, weights = np.polynomial.hermite_e.hermegauss(80)
     rate = 1.5 * np.exp(level + scale * nodes)
     below, up_to = (weights @ stats.poisson.cdf(count, rate) / weights.sum() for count in (1.0, 2.0))
@@ -77,7 +78,7 @@ def test_counts_have_residuals(result):
 
 def test_log_score_is_that_of_the_family_along_the_paths(ahead):
     """Against SciPy: the mean over the draws of the Poisson probability at each path's own rate."""
-    predicted, posterior = (arviz_data.group(ahead, name) for name in ("predictions", "posterior"))
+    predicted, posterior = (ResultView.of(ahead).group(name) for name in ("predictions", "posterior"))
     level = posterior["level"].values[:, predicted["draw"].values]
     rate = 1.5 * np.exp(level[..., None] + predicted["forces"].values[..., 0]).reshape(-1, 2)
     log_p = special.logsumexp(stats.poisson.logpmf(HELD_OUT[:, 0], rate), axis=0) - np.log(len(rate))
@@ -89,7 +90,7 @@ def test_log_score_is_that_of_the_family_along_the_paths(ahead):
     assert result["crps"] == pytest.approx(far.mean(), rel=1e-12)
     assert np.isnan(lfm.score(ahead, HELD_OUT).loc["events", "log_score"])
     with pytest.raises(ValueError, match="dataset"):
-        lfm.score(arviz_data.group(ahead, "predictions"), HELD_OUT, numpyro_model=counts)
+        lfm.score(ResultView.of(ahead).group("predictions"), HELD_OUT, numpyro_model=counts)
 
 
 def test_densities_are_those_of_the_times_that_are_asked_for():
@@ -121,7 +122,7 @@ def test_check_by_importance_sampling_and_correction(result):
     assert np.abs(ratio).max() < 0.15 + 5 * report.dataset["noise_sd"].values.max()
     assert report.k < report.threshold
     corrected = lfm.correct_posterior(result, counts, trajectory_draws=10)
-    drawn = arviz_data.group(corrected, "posterior_predictive")["y"].values
+    drawn = ResultView.of(corrected).group("posterior_predictive")["y"].values
     assert np.all(drawn == np.round(drawn))
     with pytest.raises(ValueError, match="log likelihoods"):
         lfm.check_accuracy(result, lambda times, y=None: counts(times, y, FactorSettings()), TIMES, COUNTS + 1.0,
@@ -130,7 +131,7 @@ def test_check_by_importance_sampling_and_correction(result):
 
 def test_unconverged_factors_are_counted_and_named(result):
     """With few sweeps allowed they converge at some points and not at others."""
-    stored = json.loads(arviz_data.attributes(result)["factor_failures"])
+    stored = json.loads(ResultView.of(result).attrs["factor_failures"])
     assert stored == [100, 0, 0] and not any("factors" in text for text in arviz_data.convergence_warnings(result))
     bound = lfm.bind(counts, TIMES, COUNTS, factors=FactorSettings(sweeps=9))
     computed = factor_failures(bound, 2.0 * np.random.default_rng(0).normal(size=(1, 50, 2)))
@@ -169,8 +170,8 @@ def test_particles_check_and_correct_counts_of_dynamics_that_are_not_linear():
                                trajectory_draws=20, progress=False) for sampler in ("nuts", "pmmh"))
     report = lfm.check_accuracy(filtered, driven, draws=40, particles=2000, replicates=3, progress=False)
     assert "particle filter" in report.reference and report.k < report.threshold
-    means = [float(arviz_data.group(one, "posterior")["level"].mean()) for one in (filtered, exact)]
-    sd = float(arviz_data.group(exact, "posterior")["level"].std())
+    means = [float(ResultView.of(one).posterior["level"].mean()) for one in (filtered, exact)]
+    sd = float(ResultView.of(exact).posterior["level"].std())
     assert abs(means[0] - means[1]) < 0.4 * sd
-    drawn = arviz_data.group(lfm.forecast(exact, driven, AHEAD, draws=20), "predictions")["y"].values
+    drawn = ResultView.of(lfm.forecast(exact, driven, AHEAD, draws=20)).group("predictions")["y"].values
     assert np.all(drawn == np.round(drawn))

@@ -11,6 +11,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data, tables
+from lfm_ppl.results.result_view import ResultView
 
 TIMES = np.linspace(0.0, 4.0, 6)
 PRIORS = {"half normal": dist.HalfNormal(1.0), "log normal": dist.LogNormal(0.0, 2.0)}
@@ -55,7 +56,7 @@ def test_a_group_that_collapses_is_named_everywhere(y, keywords, tmp_path):
     result = fitted(y * keywords.get("unit", 1.0), **keywords)
     table = arviz_data.summary(result)
     assert table.loc["spread", "mode"] < 1e-4
-    message, *conflicts = json.loads(arviz_data.attributes(result)["warnings"])
+    message, *conflicts = json.loads(ResultView.of(result).attrs["warnings"])
     assert all("spread" in conflict and "prior" in conflict for conflict in conflicts)
     assert message == arviz_data.convergence_warnings(result)[0]
     assert "spread" in message
@@ -70,7 +71,7 @@ def test_a_group_that_collapses_is_named_everywhere(y, keywords, tmp_path):
 def test_a_proper_mode_gives_no_warning(y):
     """The same model in non-centred form."""
     result = fitted(y, centred=False)
-    assert json.loads(arviz_data.attributes(result)["warnings"]) == []
+    assert json.loads(ResultView.of(result).attrs["warnings"]) == []
     assert "warnings" not in arviz_data.summary(result)
 
 

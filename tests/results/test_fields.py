@@ -5,9 +5,10 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
-from lfm_ppl.results.arviz_data import add_group, build, group, groups
+from lfm_ppl.results.arviz_data import add_group, build
 from lfm_ppl.results.fields import add_fields
 from lfm_ppl.results.plots import save_figures
+from lfm_ppl.results.result_view import ResultView
 
 BASIS = lfm.LaplaceBasis((0.0, 2.0), 3)
 TIMES = np.linspace(0.0, 4.0, 9)
@@ -51,8 +52,8 @@ def test_moments_are_those_of_the_draws_with_their_parameters(result):
 
 
 def test_fixed_parameters_are_those_of_the_fit(result):
-    fixed = build({"posterior": group(result, "posterior").rename(scale="decay"),
-                   "trajectories": group(result, "trajectories")}, {"fixed": '{"scale": 0.7}'})
+    fixed = build({"posterior": ResultView.of(result).posterior.rename(scale="decay"),
+                   "trajectories": ResultView.of(result).group("trajectories")}, {"fixed": '{"scale": 0.7}'})
     expected = lfm.evaluate_field(fixed, source({"scale": 0.7}), [0.3])
     np.testing.assert_allclose(lfm.evaluate_field(fixed, source, [0.3])["mean"], expected["mean"], atol=1e-12)
 
@@ -78,7 +79,7 @@ def test_figures_have_labels_and_their_numbers(result, field, sensors, width):
 
 def test_stored_fields_are_drawn_with_the_figures(result, tmp_path):
     add_fields(result, {"heat": {"field": BASIS, "sensors": np.array([0.4]), "unit": "K"}})
-    assert "field_heat" in groups(result)
+    assert "field_heat" in ResultView.of(result).groups
     lfm.save(result, tmp_path / "posterior.nc")
     paths = save_figures(lfm.load(tmp_path / "posterior.nc"), tmp_path)
     assert "field-heat.png" in {path.name for path in paths}
@@ -92,4 +93,4 @@ def test_malformed_input(result):
     with pytest.raises(ValueError, match="field_heat"):
         lfm.plot_field(result, "heat")
     with pytest.raises(ValueError, match="trajectories"):
-        lfm.evaluate_field(add_group(build({}), "posterior", group(result, "posterior")), BASIS)
+        lfm.evaluate_field(add_group(build({}), "posterior", ResultView.of(result).posterior), BASIS)

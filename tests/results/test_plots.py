@@ -27,6 +27,7 @@ from lfm_ppl.results.plots import (
     style,
 )
 from lfm_ppl.results.predictions import PERIODS
+from lfm_ppl.results.result_view import ResultView
 
 FIGURES = [plot_fit, plot_forces, plot_states, plot_trace, plot_pairs, plot_residuals]
 
@@ -246,7 +247,7 @@ def test_a_short_forecast_shows_the_last_rows_and_held_out_data(datasets):
     marks = the_line(axes, "held-out data")
     np.testing.assert_array_equal(marks.get_xydata(), [[13.0, 2.0], [13.5, np.nan]])
     assert marks.get_linestyle() == "None"
-    whole = plot_fit(forecasts.without_forecast(result)).axes[1]
+    whole = plot_fit(forecasts.without_forecast(ResultView.of(result))).axes[1]
     assert not lines(whole, "last observation") and the_line(whole, "data").get_xdata().min() == 0.0
 
 

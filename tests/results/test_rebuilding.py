@@ -9,6 +9,7 @@ from lfm_ppl.io.data_set import InputTable
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import GROUP, to_dataset
 from lfm_ppl.results.rebuilding import continued_tables, keywords
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.workflows.forecast import _inputs_by_name
 
 HEATER = InputTable(np.array([0.0, 2.0]), np.array([0.5, 0.0]))
@@ -77,9 +78,9 @@ def test_each_series_of_a_panel_has_its_own_table():
     assert dose.values.tolist() == [[4.0, 0.0], [4.0, 5.0]] and infusion.values.tolist() == [[8.0], [8.0]]
     assert np.asarray(arguments["inputs"]["heater"].values)[:, -1].tolist() == [3.0, 0.0]
     with pytest.raises(ValueError, match="'dose'.*dose of series Ann.*Each series"):
-        _inputs_by_name(panel, {"dose": ([12.0], [5.0])}, lambda times, y=None, inputs=None: None, (None, "h"))
+        _inputs_by_name(ResultView.of(panel), {"dose": ([12.0], [5.0])}, lambda times, y=None, inputs=None: None)
     with pytest.raises(ValueError, match="'heatr'.*heater"):
-        _inputs_by_name(FITTED, {"heatr": ([12.0], [5.0])}, lambda times, y=None, inputs=None: None, (None, "h"))
+        _inputs_by_name(ResultView.of(FITTED), {"heatr": ([12.0], [5.0])}, lambda times, y=None, inputs=None: None)
 
 
 def test_later_data_are_converted_to_the_clock_of_the_fit():
@@ -89,12 +90,13 @@ def test_later_data_are_converted_to_the_clock_of_the_fit():
     def later(times, unit):
         return lfm.Data(times, [[np.nan]] * 2, ("x",), {"time": unit}, inputs={"heater": (times, [1.0, 2.0])})
 
-    minutes = _inputs_by_name(FITTED, later([360.0, 420.0], "min"), model, (None, "h"))
+    view = ResultView.of(FITTED)
+    minutes = _inputs_by_name(view, later([360.0, 420.0], "min"), model)
     assert minutes["heater"].times.tolist() == [6.0, 7.0]
     with pytest.raises(ValueError, match="inputs: .* kyr, .* unit of the result, h"):
-        _inputs_by_name(FITTED, later([360.0, 420.0], "kyr"), model, (None, "h"))
+        _inputs_by_name(view, later([360.0, 420.0], "kyr"), model)
     with pytest.raises(ValueError, match="inputs: its times are dates, the times of the result plain numbers"):
-        _inputs_by_name(FITTED, later(np.array(["2026-01-01", "2026-01-02"], "datetime64[s]"), "h"), model, (None, "h"))
+        _inputs_by_name(view, later(np.array(["2026-01-01", "2026-01-02"], "datetime64[s]"), "h"), model)
     dated = result({"heater": HEATER}, origin="2026-01-01T00:00:00")
     dates = np.array(["2026-01-01T06", "2026-01-01T12"], "datetime64[s]")
     assert continued_tables(dated, {"heater": (dates, [1.0, 2.0])})["heater"].times.tolist() == [0.0, 2.0, 6.0, 12.0]

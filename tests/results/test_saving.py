@@ -9,6 +9,7 @@ import xarray as xr
 
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.plots import save_figures
+from lfm_ppl.results.result_view import ResultView
 
 ALL = ["fit", "forces", "states", "trace", "pairs", "residuals"]
 
@@ -57,8 +58,8 @@ def test_unknown_format(tmp_path, result):
 @pytest.mark.slow
 def test_long_lists_go_to_numbered_pages(tmp_path, crowded, monkeypatch):
     saving = import_module("lfm_ppl.results.plots.saving")
-    trajectories = arviz_data.group(crowded, "trajectories")
-    data = arviz_data.group(crowded, "data")
+    trajectories = ResultView.of(crowded).group("trajectories")
+    data = ResultView.of(crowded).group("data")
     small = arviz_data.build({"trajectories": trajectories, "data": data})
     paths = save_figures(small, tmp_path, width="column")
     assert [path.name for path in paths] == ["fit-1.png", "fit-2.png"]

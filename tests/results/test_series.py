@@ -8,7 +8,7 @@ import xarray as xr
 
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.arviz_data import group
+from lfm_ppl.results.result_view import ResultView
 
 
 @pytest.fixture
@@ -33,14 +33,14 @@ def panel():
 
 def test_rows_scores_and_units(panel):
     view = lfm.select_series(panel, 7)
-    data = group(view, "data")
+    data = ResultView.of(view).group("data")
     assert data["y"].dims == ("time", "output") and data["time"].attrs == {"units": "h"}
     np.testing.assert_array_equal(data["time"], [0.0, 1.0])
-    np.testing.assert_array_equal(group(view, "log_likelihood")["y"][0, 0], [0.0, 1.0])
-    other = lfm.select_series(panel, "9")
-    np.testing.assert_array_equal(group(other, "data")["time"], [0.0, 2.0, 4.0])  # missing, and no padding
-    np.testing.assert_array_equal(group(other, "log_likelihood")["y"][0, 0], [2.0, 3.0])
-    assert "accuracy" not in arviz_data.groups(view)
+    np.testing.assert_array_equal(ResultView.of(view).group("log_likelihood")["y"][0, 0], [0.0, 1.0])
+    other = ResultView.of(lfm.select_series(panel, "9"))
+    np.testing.assert_array_equal(other.group("data")["time"], [0.0, 2.0, 4.0])  # missing, and no padding
+    np.testing.assert_array_equal(other.group("log_likelihood")["y"][0, 0], [2.0, 3.0])
+    assert "accuracy" not in ResultView.of(view).groups
 
 
 def test_parameters_and_their_mode(panel):
@@ -50,4 +50,4 @@ def test_parameters_and_their_mode(panel):
         assert table.loc["scale", "mode"] == mode and table.loc["shared", "mode"] == 2.0
         assert ("warnings" in table) == (warning is not None)
         assert warning is None or table.loc["scale", "warnings"] == warning
-    assert arviz_data.attributes(lfm.select_series(panel, 0))["selected"] == "subject 7"
+    assert ResultView.of(lfm.select_series(panel, 0)).attrs["selected"] == "subject 7"

@@ -104,3 +104,13 @@ def test_the_reference_is_the_last_season_with_the_spread_of_its_changes():
 def test_wrong_arguments_are_named(change, name):
     with pytest.raises(ValueError, match=name):
         lfm.backtest(motif.model, **{"times": TIMES, "y": data(), "horizon": 1, **change})
+
+
+def test_an_error_of_a_fit_keeps_its_type_and_names_the_origin(monkeypatch):
+    def fail(*arguments, **keywords):
+        raise UnicodeDecodeError("ascii", b"\xff", 0, 1, "not a text")  # a type that takes five arguments
+
+    monkeypatch.setattr("lfm_ppl.workflows.backtest.fit", fail)
+    with pytest.raises(UnicodeDecodeError) as raised:
+        lfm.backtest(motif.model, TIMES, data(), horizon=1, first=4)
+    assert raised.value.__notes__ == ["at the origin 2.5 (row 4)"]

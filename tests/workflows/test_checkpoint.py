@@ -24,6 +24,7 @@ from lfm_ppl.cli import main
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.results import arviz_data
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.storage import checkpoint as checkpoints
 from lfm_ppl.storage import run_record
 from lfm_ppl.storage.checkpoint import Checkpoint
@@ -55,10 +56,10 @@ def fit(sampler, **changes):
 
 def assert_same(result, expected):
     """All groups are equal to the last bit, and so is what is said of them, but for times."""
-    assert set(arviz_data.groups(result)) == set(arviz_data.groups(expected))
-    for name in arviz_data.groups(expected):
-        xr.testing.assert_identical(arviz_data.group(result, name), arviz_data.group(expected, name))
-    ours, theirs = arviz_data.attributes(result), arviz_data.attributes(expected)
+    assert set(ResultView.of(result).groups) == set(ResultView.of(expected).groups)
+    for name in ResultView.of(expected).groups:
+        xr.testing.assert_identical(ResultView.of(result).group(name), ResultView.of(expected).group(name))
+    ours, theirs = ResultView.of(result).attrs, ResultView.of(expected).attrs
     for attrs in (ours, theirs):
         for name in ("wall_time_s", "created_at", "run"):
             attrs.pop(name, None)
@@ -105,12 +106,12 @@ def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_pat
         fit(sampler, checkpoint=tmp_path / "run")
     stop_after(3)
     partial = fit(sampler, checkpoint=tmp_path / "run", resume=True)
-    said = arviz_data.attributes(partial)["partial"]
-    count = arviz_data.group(partial, "posterior").sizes["draw"]
+    said = ResultView.of(partial).attrs["partial"]
+    count = ResultView.of(partial).posterior.sizes["draw"]
     assert 3 <= count < 6 and said.startswith(f"{count} of 6 draws")
     for name in ("posterior", "sample_stats"):
-        xr.testing.assert_identical(arviz_data.group(partial, name),
-                                    arviz_data.group(expected, name).isel(draw=slice(count)))
+        xr.testing.assert_identical(ResultView.of(partial).group(name),
+                                    ResultView.of(expected).group(name).isel(draw=slice(count)))
     assert_same(lfm.load(tmp_path / "run"), partial)
     assert arviz_data.summary(partial)["partial"].str.startswith(f"{count} of 6 draws").all()
     assert_same(fit(sampler, checkpoint=tmp_path / "run", resume=True), expected)
@@ -129,10 +130,10 @@ def test_a_stop_after_sampling_costs_no_draw(whole, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("lfm_ppl.workflows.fit_results.trajectories", stop)
         partial = fit(sampler, checkpoint=tmp_path)
-    said = arviz_data.attributes(partial)["partial"]
+    said = ResultView.of(partial).attrs["partial"]
     assert "trajectories" in said
-    assert "log_likelihood" in arviz_data.groups(partial) and "trajectories" not in arviz_data.groups(partial)
-    xr.testing.assert_identical(arviz_data.group(partial, "posterior"), arviz_data.group(whole(sampler), "posterior"))
+    assert "log_likelihood" in ResultView.of(partial).groups and "trajectories" not in ResultView.of(partial).groups
+    xr.testing.assert_identical(ResultView.of(partial).posterior, ResultView.of(whole(sampler)).posterior)
     # Nothing is searched or sampled again.
     for module in ("workflows.fit", "workflows.fit_starts", "inference.laplace_start"):
         monkeypatch.setattr(f"lfm_ppl.{module}.mode_of", stop)
@@ -153,9 +154,9 @@ def test_a_run_that_nothing_keeps_gives_what_it_has(whole, monkeypatch):
     monkeypatch.setattr(sampling._BlockLength, "adapt", stopping)
     with pytest.raises(KeyboardInterrupt, match="3 of 6 draws") as raised:
         fit("nuts")
-    assert arviz_data.attributes(raised.value.result)["partial"].startswith("3 of 6 draws")
-    np.testing.assert_array_equal(arviz_data.group(raised.value.result, "posterior")["noise"],
-                                  arviz_data.group(whole("nuts"), "posterior")["noise"][:, :3])
+    assert ResultView.of(raised.value.result).attrs["partial"].startswith("3 of 6 draws")
+    np.testing.assert_array_equal(ResultView.of(raised.value.result).posterior["noise"],
+                                  ResultView.of(whole("nuts")).posterior["noise"][:, :3])
 
 
 # Refusals
@@ -368,9 +369,9 @@ def test_ctrl_c_leaves_a_usable_result_within_ten_seconds(tmp_path):
     process, out, seconds = stopped(tmp_path)
     assert process.returncode == 130 and seconds < 10, out
     result = lfm.load(tmp_path / "run")
-    count = arviz_data.group(result, "posterior").sizes["draw"]
+    count = ResultView.of(result).posterior.sizes["draw"]
     assert 0 < count < 1000000
-    for said in (arviz_data.attributes(result)["partial"], out, (tmp_path / "run" / "summary.csv").read_text()):
+    for said in (ResultView.of(result).attrs["partial"], out, (tmp_path / "run" / "summary.csv").read_text()):
         assert f"{count} of 1000000 draws" in said
 
 

@@ -16,6 +16,7 @@ from scipy.interpolate import CubicSpline
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.layout import Labels, checked_truth, unplaced
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.workflows import fit_starts
 from lfm_ppl.workflows.fit_options import FitOptions
 from tests.inference import linear_motif as motif
@@ -55,7 +56,7 @@ def known(y):
 
 
 def group(result, name):
-    return arviz_data.group(result, name)
+    return ResultView.of(result).group(name)
 
 
 # Groups, dimensions, coordinates, units and attributes
@@ -86,7 +87,7 @@ def test_groups_and_dimensions(nuts):
                   "lengthscale": (), "noise_sd": (), "outputs": ("at_truth", "output"),
                   "deterministics": ("at_truth", "deterministic")},
     }
-    assert set(arviz_data.groups(nuts)) == {*expected, "sample_stats"}
+    assert set(ResultView.of(nuts).groups) == {*expected, "sample_stats"}
     for name, variables in expected.items():
         dataset = group(nuts, name)
         assert {variable: dataset[variable].dims for variable in dataset.data_vars} == variables
@@ -127,7 +128,7 @@ def test_entries_of_a_truth_that_the_model_does_not_have_are_named(y):
 
 
 def test_attributes_say_how_it_was_made(nuts):
-    attrs = arviz_data.attributes(nuts)
+    attrs = ResultView.of(nuts).attrs
     assert (attrs["model"], attrs["sampler"], attrs["rule"], attrs["steps"]) == ("motif", "nuts", "Cubature()", 10)
     assert (attrs["seed"], attrs["chains"], attrs["warmup"], attrs["samples"]) == (0, 2, 60, 40)
     assert json.loads(attrs["fixed"]) == {"decay[b]": 1.2}
@@ -146,9 +147,9 @@ def test_attributes_say_how_it_was_made(nuts):
 
 def test_file_round_trip(nuts, tmp_path):
     loaded = arviz_data.load(arviz_data.save(nuts, tmp_path / "result.nc"))
-    assert arviz_data.attributes(loaded) == arviz_data.attributes(nuts)
-    assert set(arviz_data.groups(loaded)) == set(arviz_data.groups(nuts))
-    for name in arviz_data.groups(nuts):
+    assert ResultView.of(loaded).attrs == ResultView.of(nuts).attrs
+    assert set(ResultView.of(loaded).groups) == set(ResultView.of(nuts).groups)
+    for name in ResultView.of(nuts).groups:
         xr.testing.assert_identical(group(loaded, name), group(nuts, name))
 
 
@@ -332,10 +333,10 @@ def test_deterministics_follow_the_path_and_have_its_bands(known, y):
 
 
 def test_mode_of_known_parameters(known):
-    attrs = arviz_data.attributes(known)
+    attrs = ResultView.of(known).attrs
     assert (attrs["sampler"], attrs["chains"], attrs["warmup"]) == ("map", 1, 0)
     assert attrs["map_converged"] == 1
-    assert "sample_stats" not in arviz_data.groups(known)
+    assert "sample_stats" not in ResultView.of(known).groups
     posterior = group(known, "posterior")
     np.testing.assert_allclose(posterior["noise_sd"], motif.THETA["noise_sd"], rtol=10 * NEAR)
     # With known parameters the evidence is the likelihood
@@ -366,7 +367,7 @@ def test_panel():
     y[1, 3] = np.nan
     result = quiet_fit(shared, times, y, sampler="ram", chains=2, warmup=20, samples=10, trajectory_draws=4,
                        at=[0.0, 2.0], chain_method="vectorized", sampler_options={"adapt": "throughout"})
-    sizes = {name: dict(group(result, name).sizes) for name in arviz_data.groups(result)}
+    sizes = {name: dict(group(result, name).sizes) for name in ResultView.of(result).groups}
     assert sizes["posterior"] == {"chain": 2, "draw": 10, "series": 2}
     assert sizes["log_likelihood"] == {"chain": 2, "draw": 10, "observation": 7}
     assert sizes["one_step_ahead"] == {"chain": 2, "draw": 10, "series": 2, "time": 4, "output": 1}
@@ -398,7 +399,7 @@ def test_the_same_seed_gives_the_same_result(y):
     for name in ("posterior", "trajectories", "posterior_predictive", "log_likelihood"):
         xr.testing.assert_identical(group(again, name), group(first, name))
         assert not group(other, name).equals(group(first, name))
-    attrs = arviz_data.attributes(first)
+    attrs = ResultView.of(first).attrs
     assert (attrs["model"], attrs["thin"]) == ("model", 15)  # five steps for each of three parameters
 
 
@@ -431,7 +432,7 @@ def test_times_are_known_to_everything_after_sampling(y):
     keywords = {"start": -1.0, "max_step": 0.1}
     result = quiet_fit(converted, TIMES, y[:, :1], sampler="map", samples=4, trajectory_draws=2, at=[0.5, 9.0],
                        model_kwargs=keywords)
-    assert set(arviz_data.groups(result)) >= {"trajectories", "log_likelihood", "posterior_predictive"}
+    assert set(ResultView.of(result).groups) >= {"trajectories", "log_likelihood", "posterior_predictive"}
     assert group(result, "trajectories")["forces"].sizes["at"] == 2
     decay = float(group(result, "posterior")["decay"][0, 3])
     values = {"decay": jnp.asarray(decay)}
@@ -449,7 +450,7 @@ def test_what_fails_after_sampling_does_not_cost_the_draws(y, monkeypatch):
     with pytest.warns(UserWarning, match="scores.*no such thing"):
         result = lfm.fit(motif.model, TIMES, y, sampler="map", samples=5, trajectory_draws=0)
     assert group(result, "posterior")["decay"].shape == (1, 5, 2)
-    assert "log_likelihood" not in arviz_data.groups(result)
+    assert "log_likelihood" not in ResultView.of(result).groups
 
 
 # Errors
@@ -562,7 +563,7 @@ def test_settings_that_the_model_leaves_open():
     settings = {"rule": lfm.GaussHermite(3), "steps": 2, "iterations": 1, "method": "exponential"}
     fit = functools.partial(quiet_fit, model, TIMES, y, sampler="map", samples=10, trajectory_draws=0)
     result = fit(**settings)
-    attributes = arviz_data.attributes(result)
+    attributes = ResultView.of(result).attrs
     assert (attributes["rule"], attributes["steps"], attributes["iterations"], attributes["method"]) == (
         settings["rule"].name, 2, 1, "exponential")
     assert "rule=rule, steps=2, iterations=1, method='exponential'" in attributes["call"]
@@ -570,5 +571,5 @@ def test_settings_that_the_model_leaves_open():
     assert (rebuilt.rule, rebuilt.steps, rebuilt.iterations, rebuilt.method) == tuple(settings.values())
     with pytest.warns(UserWarning, match=r"steps=2 .* 'y'.*steps=5 has no effect.*lfm\.approximate"):
         named = fit(model_kwargs={"steps": 2}, **settings | {"steps": 5})
-    assert arviz_data.attributes(named)["steps"] == 2
+    assert ResultView.of(named).attrs["steps"] == 2
     np.testing.assert_allclose(group(named, "posterior")["rate"], group(result, "posterior")["rate"], rtol=1e-6)

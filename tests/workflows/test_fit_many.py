@@ -14,7 +14,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
-from lfm_ppl.results import arviz_data
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.workflows import fit_tasks
 from tests.inference import linear_motif as motif
 
@@ -34,7 +34,7 @@ def poisoned(count=3):
 
 
 def draws(result):
-    return {name: np.asarray(value) for name, value in arviz_data.group(result, "posterior").items()}
+    return {name: np.asarray(value) for name, value in ResultView.of(result).posterior.items()}
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +50,12 @@ def test_each_result_is_that_of_a_fit(folder):
     assert [one.name for one in yielded] == ["plant 0", "plant 1", "plant 2"] and len(fits) == 3
     own = lfm.fit(motif.model, *data_sets()["plant 2"], seed=fit_tasks.seed_of("plant 2"), progress=False, **OPTIONS)
     result = yielded[2].result
-    assert arviz_data.groups(result) == arviz_data.groups(own)
-    for name in arviz_data.groups(own):
-        one, other = arviz_data.group(own, name), arviz_data.group(result, name)
+    assert tuple(ResultView.of(result).groups) == tuple(ResultView.of(own).groups)
+    for name in ResultView.of(own).groups:
+        one, other = ResultView.of(own).group(name), ResultView.of(result).group(name)
         assert one.equals(other) and {k: v.attrs for k, v in one.variables.items()} == {
             k: v.attrs for k, v in other.variables.items()}, name
-    attrs, expected = arviz_data.attributes(result), arviz_data.attributes(own)
+    attrs, expected = ResultView.of(result).attrs, ResultView.of(own).attrs
     assert json.loads(attrs.pop("warnings")) == json.loads(expected.pop("warnings")) == []
     for measured in ("wall_time_s", "created_at"):
         attrs.pop(measured), expected.pop(measured)
@@ -77,7 +77,7 @@ def test_one_table_and_one_file_over_all(folder):
     means = fits.summary["mean"].groupby(level="parameter", sort=False)
     np.testing.assert_allclose(fits.overview["mean"], means.mean())
     assert len(pd.read_csv(out / "summary.csv")) == 8
-    posterior = arviz_data.group(lfm.load(out / "posteriors.nc"), "posterior")
+    posterior = ResultView.of(lfm.load(out / "posteriors.nc")).posterior
     assert posterior["decay"].dims == ("chain", "draw", "data_set", "output")
     for one in (yielded[0], yielded[2]):
         for name, values in draws(one.result).items():
@@ -124,10 +124,10 @@ def test_data_and_arguments_of_one_data_set():
     pairs = [("a", lfm.Data(TIMES, motif.data(0), ("a", "b"), truth={"parameters": {"noise_sd": 0.2}})),
              ("b", data_sets()["plant 1"])]
     fits = lfm.fit_many(motif.model, pairs, each={"b": {"samples": 10}}, **OPTIONS).run()
-    noise = arviz_data.group(fits.combined(), "posterior")["noise_sd"].sel(chain=0)
+    noise = ResultView.of(fits.combined()).posterior["noise_sd"].sel(chain=0)
     assert np.isfinite(noise.sel(data_set="a")).all()
     np.testing.assert_array_equal(np.isfinite(noise.sel(data_set="b")), np.arange(20) < 10)
-    assert arviz_data.group(fits.combined(), "truth").sizes["data_set"] == 1
+    assert ResultView.of(fits.combined()).group("truth").sizes["data_set"] == 1
 
 
 @pytest.mark.parametrize("sets, options, message", [

@@ -17,6 +17,7 @@ from lfm_ppl.io.data_set import InputTable
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import to_dataset
 from lfm_ppl.results.predictions import noise_free_interval, summary
+from lfm_ppl.results.result_view import ResultView
 from tests.inference import linear_motif as motif
 
 NEAR = 1e-7
@@ -33,7 +34,7 @@ def well(times, y=None, iterations=3):
 
 
 def predictions(result):
-    return arviz_data.group(result, "predictions")
+    return ResultView.of(result).group("predictions")
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +81,8 @@ def test_new_data_of_a_linear_model_are_exact_jointly_in_time(ahead, exact):
 
 def test_groups_coordinates_and_units(ahead, known):
     result = predictions(ahead)
-    assert "predictions" not in arviz_data.groups(known)  # a new object
-    assert set(arviz_data.groups(ahead)) == {*arviz_data.groups(known), "predictions"}
+    assert "predictions" not in ResultView.of(known).groups  # a new object
+    assert set(ResultView.of(ahead).groups) == {*ResultView.of(known).groups, "predictions"}
     assert result["y"].dims == ("chain", "draw", "time", "output")
     assert result["forces"].dims == ("chain", "draw", "time", "force")
     np.testing.assert_array_equal(result["time"], AT)

@@ -10,8 +10,8 @@ from matplotlib import pyplot
 
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data, rebuilding
-from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.plots import plot_fit, plot_forces, plot_residuals, plot_states
+from lfm_ppl.results.result_view import ResultView
 
 TIMES = np.array([[0.0, 1.0, 2.5, 4.0], [0.0, 0.5, 3.0, 3.0]])
 Y = np.array([[1.0, 0.7, 0.5, 0.1], [1.2, 0.9, 0.4, np.nan]])[..., None]
@@ -48,19 +48,19 @@ def smoothed(series, times):
 
 def test_the_plate_is_a_dimension_of_every_group(result):
     for name in ("posterior", "data", "one_step_ahead", "trajectories"):
-        assert group(result, name)["patient"].values.tolist() == LABELS, name
+        assert ResultView.of(result).group(name)["patient"].values.tolist() == LABELS, name
     series, rows, _ = np.nonzero(np.isfinite(Y))
     for name in ("observed_data", "log_likelihood", "posterior_predictive"):
-        np.testing.assert_array_equal(group(result, name)["patient"], np.array(LABELS)[series])
-        np.testing.assert_array_equal(group(result, name)["time"], TIMES[series, rows])
-    assert group(result, "data")["times"].dims == ("patient", "time")
-    assert group(result, "trajectories")["times"].dims == ("patient", "at")
+        np.testing.assert_array_equal(ResultView.of(result).group(name)["patient"], np.array(LABELS)[series])
+        np.testing.assert_array_equal(ResultView.of(result).group(name)["time"], TIMES[series, rows])
+    assert ResultView.of(result).group("data")["times"].dims == ("patient", "time")
+    assert ResultView.of(result).group("trajectories")["times"].dims == ("patient", "at")
 
 
 @pytest.mark.parametrize("series", [0, 1])
 def test_a_selected_series_is_smoothed_as_if_alone(result, series):
     view = lfm.select_series(result, LABELS[series])
-    observed, paths = group(view, "data"), group(view, "trajectories")
+    observed, paths = ResultView.of(view).group("data"), ResultView.of(view).group("trajectories")
     rows = np.isfinite(Y[series, :, 0])
     np.testing.assert_array_equal(observed["time"], TIMES[series, rows])
     np.testing.assert_array_equal(observed["y"], Y[series, rows])
@@ -71,15 +71,15 @@ def test_a_selected_series_is_smoothed_as_if_alone(result, series):
     np.testing.assert_allclose(mean, expected.mean, atol=1e-9)
     np.testing.assert_allclose(high - mean, 1.959964 * expected.sd, rtol=1e-3)
     alone = lfm.smooth(build(RATES[series]), TIMES[series, rows], Y[series, rows])
-    np.testing.assert_allclose(group(view, "log_likelihood")["y"][0, 0], alone.leave_one_out, rtol=1e-9)
-    assert group(view, "posterior")["rate"].dims == ("chain", "draw")
+    np.testing.assert_allclose(ResultView.of(view).group("log_likelihood")["y"][0, 0], alone.leave_one_out, rtol=1e-9)
+    assert ResultView.of(view).posterior["rate"].dims == ("chain", "draw")
 
 
 @pytest.mark.parametrize("times", [[6.0, 7.0], [[1.5, 7.0], [3.5, 9.0]]])
 def test_a_forecast_is_that_of_each_series(result, times):
     ahead = lfm.forecast(result, model, times, progress=False)
     for series, requested in enumerate(np.broadcast_to(times, (2, 2))):
-        predicted = group(lfm.select_series(ahead, series), "predictions")
+        predicted = ResultView.of(lfm.select_series(ahead, series)).group("predictions")
         assert predicted["y"].dims == ("chain", "draw", "time", "output")
         np.testing.assert_array_equal(predicted["time"], requested)
         expected = smoothed(series, requested)
@@ -96,10 +96,11 @@ def test_a_forecast_of_a_selected_series_is_that_of_the_panel(result, times, tmp
         lfm.save(view, tmp_path / f"{series}.nc")
         for stored in (view, lfm.load(tmp_path / f"{series}.nc")):
             alone = lfm.forecast(stored, model, times, progress=False)
-            predicted, expected = (group(one, "predictions") for one in (alone, lfm.select_series(ahead, series)))
+            predicted, expected = (ResultView.of(part).group("predictions")
+                                   for part in (alone, lfm.select_series(ahead, series)))
             xr.testing.assert_allclose(predicted, expected)
             assert predicted.attrs == expected.attrs
-        assert set(arviz_data.groups(alone)) == {*arviz_data.groups(view), "predictions"}
+        assert set(ResultView.of(alone).groups) == {*ResultView.of(view).groups, "predictions"}
         assert lfm.plot_fit(alone) is not None
         assert lfm.score(alone, np.zeros((len(times), 1))).loc["all", "n"] == len(times)
 
@@ -121,9 +122,9 @@ def test_a_nonlinear_forecast_follows_the_dynamics(result):
                 jnp.array([1.0, 2.0]), times, steps=20), obs=y)
 
     draws = xr.Dataset({"scale": (("chain", "draw"), np.ones((1, 2)))})
-    result = arviz_data.build({"posterior": draws, "data": group(result, "data")})
+    result = arviz_data.build({"posterior": draws, "data": ResultView.of(result).group("data")})
     times = np.array([[1.5, 5.0, 9.0], [0.2, 3.5, 4.0]])
-    states = group(lfm.forecast(result, cubic, times, progress=False), "predictions")["states"]
+    states = ResultView.of(lfm.forecast(result, cubic, times, progress=False)).group("predictions")["states"]
     exact = (np.array([[1.0], [2.0]]) ** -2 + 2 * times) ** -0.5
     np.testing.assert_allclose(states[0, 0, ..., 0], exact, rtol=1e-4)
 

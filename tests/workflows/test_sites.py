@@ -13,6 +13,7 @@ import lfm_ppl as lfm
 from lfm_ppl.inference.trajectories import trajectories
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.plots import save_figures
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.workflows.data_binding import data_by_site
 
 TIMES = {"a": np.arange(6.0), "b": np.arange(0.0, 4.0, 0.5)}
@@ -87,36 +88,36 @@ def test_a_sampler_of_one_site_says_so():
 
 
 def test_groups_by_site(fitted):
-    observed = arviz_data.group(fitted, "observed_data")
+    observed = ResultView.of(fitted).group("observed_data")
     assert observed["a"].dims == ("a_observation",) and observed["b"].dims == ("b_observation",)
     assert set(observed["a_output"].values) == {"level"}
     for name in Y:
         np.testing.assert_array_equal(observed[name], Y[name][np.isfinite(Y[name])])
-        np.testing.assert_array_equal(arviz_data.group(fitted, f"data_{name}")[name], Y[name])
+        np.testing.assert_array_equal(ResultView.of(fitted).group(f"data_{name}")[name], Y[name])
         count = np.isfinite(Y[name]).sum()
         for label in ("log_likelihood", "posterior_predictive"):
-            assert arviz_data.group(fitted, label)[name].shape == (1, 40, count)
-        terms = arviz_data.group(fitted, f"one_step_ahead_{name}")["log_density"]
-        rates = arviz_data.group(fitted, "posterior")["rate"].values.ravel()
+            assert ResultView.of(fitted).group(label)[name].shape == (1, 40, count)
+        terms = ResultView.of(fitted).group(f"one_step_ahead_{name}")["log_density"]
+        rates = ResultView.of(fitted).posterior["rate"].values.ravel()
         expected = [likelihood(name, rate, TIMES[name]).log_prob(Y[name]) for rate in rates[:3]]
         np.testing.assert_allclose(terms.sum("time").values.ravel()[:3], expected, atol=1e-10)
-    assert "predictions_b" in arviz_data.groups(fitted) and "predictions_a" not in arviz_data.groups(fitted)
+    assert "predictions_b" in ResultView.of(fitted).groups and "predictions_a" not in ResultView.of(fitted).groups
     with pytest.raises(ValueError, match="select_site"):
-        arviz_data.group(fitted, "trajectories")
+        ResultView.of(fitted).group("trajectories")
 
 
 def test_a_selected_site_is_a_result_of_one_site(fitted, tmp_path):
     lfm.save(fitted, tmp_path / "fit.nc")
     for result in (fitted, lfm.load(tmp_path / "fit.nc")):
         site = lfm.select_site(result, "b")
-        assert set(arviz_data.groups(site)) == {"posterior", "log_prior", "data", "observed_data", "log_likelihood",
+        assert set(ResultView.of(site).groups) == {"posterior", "log_prior", "data", "observed_data", "log_likelihood",
                                                 "one_step_ahead", "trajectories", "posterior_predictive",
                                                  "predictions", "data_a"}
-        assert arviz_data.group(site, "data")["y"].dims == ("time", "output")
-        np.testing.assert_array_equal(arviz_data.group(site, "log_likelihood")["time"],
-                                      arviz_data.group(site, "observed_data")["time"])
-        assert arviz_data.group(site, "predictions")["y"].sizes["time"] == 2
-        assert arviz_data.attributes(site)["likelihood"].startswith("exact")
+        assert ResultView.of(site).group("data")["y"].dims == ("time", "output")
+        np.testing.assert_array_equal(ResultView.of(site).group("log_likelihood")["time"],
+                                      ResultView.of(site).group("observed_data")["time"])
+        assert ResultView.of(site).group("predictions")["y"].sizes["time"] == 2
+        assert ResultView.of(site).attrs["likelihood"].startswith("exact")
         assert lfm.plot_fit(site) is not None
     with pytest.raises(ValueError, match="'c'"):
         lfm.select_site(fitted, "c")
@@ -124,7 +125,7 @@ def test_a_selected_site_is_a_result_of_one_site(fitted, tmp_path):
 
 def test_forecast_and_score_by_site(fitted):
     ahead = lfm.forecast(fitted, both, {"a": [6.0, 7.0]}, progress=False)
-    assert arviz_data.group(ahead, "predictions_a")["a"].shape == (1, 40, 2, 1)
+    assert ResultView.of(ahead).group("predictions_a")["a"].shape == (1, 40, 2, 1)
     expected = np.exp(-0.4 * np.array([[6.0], [7.0]]))
     table = lfm.score(lfm.select_site(ahead, "a"), expected)
     assert table.index.tolist() == ["level", "all"] and table.loc["all", "rmse"] < 0.3
@@ -138,7 +139,7 @@ def test_a_forecast_of_a_selected_site_is_that_of_all_sites(fitted, tmp_path):
         lfm.save(site, tmp_path / f"{name}.nc")
         alone = lfm.forecast(lfm.load(tmp_path / f"{name}.nc"), both, times, progress=False)
         expected = lfm.select_site(lfm.forecast(fitted, both, {name: times}, progress=False), name)
-        xr.testing.assert_allclose(*(arviz_data.group(ahead, "predictions") for ahead in (alone, expected)))
+        xr.testing.assert_allclose(*(ResultView.of(ahead).group("predictions") for ahead in (alone, expected)))
         assert lfm.score(alone, np.zeros((2, len(GAIN[name])))).loc["all", "n"] == 2 * len(GAIN[name])
 
 
@@ -166,7 +167,7 @@ def test_paths_of_a_site_are_those_of_its_model_alone():
 def test_the_check_adds_the_sites(fitted):
     report = lfm.check_accuracy(fitted, both, draws=10, particles=500, replicates=2, reference="particles",
                                 progress=False)
-    rates = arviz_data.group(fitted, "posterior")["rate"].sel(draw=report.dataset["draw"]).values.ravel()
+    rates = ResultView.of(fitted).posterior["rate"].sel(draw=report.dataset["draw"]).values.ravel()
     expected = [sum(likelihood(name, rate, TIMES[name]).log_prob(Y[name]) for name in Y) for rate in rates]
     np.testing.assert_allclose(report.dataset["log_likelihood"].values.ravel(), expected, atol=1e-10)
     noise = report.dataset["noise_sd"].values.ravel()
@@ -189,9 +190,9 @@ def test_dates_of_all_sites_count_from_one_midnight():
             for name, first in (("a", "2026-01-02"), ("b", "2026-01-01"))}
     result = lfm.fit(both, {name: (days[name], Y[name]) for name in Y}, sampler="map", samples=2, trajectory_draws=0,
                      progress=False)
-    observed = arviz_data.group(result, "observed_data")
+    observed = ResultView.of(result).group("observed_data")
     assert observed["a_time"].values[0] == 1.0 and observed["b_time"].values[0] == 0.0
-    assert arviz_data.attributes(result)["time_origin"].startswith("2026-01-01")
+    assert ResultView.of(result).attrs["time_origin"].startswith("2026-01-01")
 
 
 def heated(times, y, inputs):
@@ -204,17 +205,17 @@ def test_known_inputs_reach_their_site():
     heat = (np.array([0.0, 2.0]), np.array([0.5, 0.0]))
     data = {"a": lfm.Data(TIMES["a"], Y["a"], ("level",), inputs={"heat": heat}), "b": DATA["b"]}
     result = lfm.fit(heated, data, sampler="map", samples=2, trajectory_draws=0, progress=False)
-    rate = float(arviz_data.group(result, "posterior")["rate"][0, 0])
+    rate = float(ResultView.of(result).posterior["rate"][0, 0])
     for name, known in (("a", lfm.Input(*heat)), ("b", None)):
-        terms = arviz_data.group(result, f"one_step_ahead_{name}")["log_density"][0, 0]
+        terms = ResultView.of(result).group(f"one_step_ahead_{name}")["log_density"][0, 0]
         assert float(terms.sum()) == pytest.approx(
             float(likelihood(name, rate, TIMES[name], known).log_prob(Y[name])), abs=1e-9)
     longer = lfm.Input(np.array([0.0, 2.0, 7.0]), np.array([0.5, 0.0, 1.0]))
     ahead = lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"a": {"heat": longer}}, progress=False)
-    assert {"predictions_a", "predictions_constant_data_a"} <= set(arviz_data.groups(ahead))
+    assert {"predictions_a", "predictions_constant_data_a"} <= set(ResultView.of(ahead).groups)
     alone = lfm.forecast(lfm.select_site(result, "a"), heated, [6.0, 7.0], inputs={"heat": longer}, progress=False)
-    assert arviz_data.has_group(alone, "predictions_constant_data")
-    xr.testing.assert_allclose(*(arviz_data.group(view, "predictions")["y"]
+    assert "predictions_constant_data" in ResultView.of(alone).groups
+    xr.testing.assert_allclose(*(ResultView.of(view).group("predictions")["y"]
                                  for view in (alone, lfm.select_site(ahead, "a"))))
     with pytest.raises(ValueError, match="inputs: unknown likelihood site 'heat'.*a, b"):
         lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"heat": longer}, progress=False)
@@ -234,15 +235,15 @@ def test_data_by_site_are_told_from_columns():
 
 def test_a_finished_fit_is_read_again(fitted, folder):
     again = lfm.fit(both, DATA, checkpoint=folder, resume=True, **SETTINGS)
-    np.testing.assert_array_equal(arviz_data.group(again, "posterior")["rate"],
-                                  arviz_data.group(fitted, "posterior")["rate"])
+    np.testing.assert_array_equal(ResultView.of(again).posterior["rate"],
+                                  ResultView.of(fitted).posterior["rate"])
     other = {**DATA, "b": (TIMES["b"], 2 * Y["b"])}
     with pytest.raises(ValueError, match="data"):
         lfm.fit(both, other, checkpoint=folder, resume=True, **SETTINGS)
 
 
 def test_draws_of_numpyro(fitted):
-    draws = {"rate": arviz_data.group(fitted, "posterior")["rate"].values}
+    draws = {"rate": ResultView.of(fitted).posterior["rate"].values}
     result = lfm.to_arviz(draws, both, TIMES, Y, trajectory_draws=0)
-    np.testing.assert_allclose(arviz_data.group(result, "log_likelihood")["b"],
-                               arviz_data.group(fitted, "log_likelihood")["b"], atol=1e-10)
+    np.testing.assert_allclose(ResultView.of(result).group("log_likelihood")["b"],
+                               ResultView.of(fitted).group("log_likelihood")["b"], atol=1e-10)

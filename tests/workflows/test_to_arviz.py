@@ -14,6 +14,7 @@ from numpyro.infer import MCMC, NUTS
 
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data, tables
+from lfm_ppl.results.result_view import ResultView
 from tests.inference import linear_motif as motif
 
 AT = [0.0, 6.0]
@@ -31,7 +32,7 @@ def model(times, y=None, spread=0.4):
 
 
 def group(result, name):
-    return arviz_data.group(result, name)
+    return ResultView.of(result).group(name)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +52,7 @@ def converted(mcmc):
 
 
 def test_a_plain_run_has_the_groups_of_a_fit(mcmc, converted):
-    assert set(arviz_data.groups(converted)) == {
+    assert set(ResultView.of(converted).groups) == {
         "posterior", "sample_stats", "log_likelihood", "log_prior", "one_step_ahead", "trajectories",
         "posterior_predictive", "predictions", "data", "observed_data"}
     draws = mcmc.get_samples(group_by_chain=True)
@@ -60,7 +61,7 @@ def test_a_plain_run_has_the_groups_of_a_fit(mcmc, converted):
     stats = group(converted, "sample_stats")
     assert {"acceptance_rate", "lp"} <= set(stats.data_vars)
     np.testing.assert_allclose(stats["lp"], -mcmc.get_extra_fields(group_by_chain=True)["potential_energy"])
-    assert arviz_data.attributes(converted)["sampler"] == "ram"
+    assert ResultView.of(converted).attrs["sampler"] == "ram"
 
 
 def test_one_step_ahead_densities_are_those_of_the_exact_likelihood(converted):
@@ -94,14 +95,14 @@ def test_derived_parameters_and_warnings_are_marked_in_a_file_too(converted, tmp
     posterior = group(converted, "posterior")
     assert posterior["half_life"].attrs["derived"] == 1
     assert "derived" not in posterior["decay"].attrs
-    said = json.loads(arviz_data.attributes(converted)["warnings"])
+    said = json.loads(ResultView.of(converted).attrs["warnings"])
     assert said
     table = tables.annotate(arviz_data.summary(converted), converted)
     assert table.loc["half_life[p21]", "kind"] == "derived"
     assert table.loc["noise_sd", "kind"] == "sampled"
     assert table.loc["noise_sd", "warnings"]
     again = lfm.load(lfm.save(converted, tmp_path / "posterior.nc"))
-    assert arviz_data.attributes(again)["warnings"] == arviz_data.attributes(converted)["warnings"]
+    assert ResultView.of(again).attrs["warnings"] == ResultView.of(converted).attrs["warnings"]
     assert group(again, "posterior")["half_life"].attrs["derived"] == 1
     assert group(again, "posterior")["gene"].values.tolist() == ["p21", "sestrin"]
 
@@ -111,7 +112,7 @@ def test_draws_without_an_mcmc_and_without_derived_ones(mcmc, converted):
     with pytest.warns(lfm.ConvergenceWarning):
         result = lfm.to_arviz(draws, model, motif.TIMES, motif.data(), trajectory_draws=0)
     np.testing.assert_allclose(group(result, "posterior")["half_life"], group(converted, "posterior")["half_life"])
-    assert "sample_stats" not in arviz_data.groups(result)
+    assert "sample_stats" not in ResultView.of(result).groups
     assert group(result, "posterior")["decay"].dims == ("chain", "draw", "gene")  # of `event_dims`
 
 

@@ -64,7 +64,7 @@ def laplace_factors(terms: Any, factors: Factors, marginals: FactorMarginals, po
     return slope - curvature * (m - factors.centre), -curvature, jnp.zeros_like(m)
 
 
-_NEW_SITES: dict[str, Callable] = {"ep": ep_factors, "variational": variational_factors, "laplace": laplace_factors}
+_NEW_FACTORS: dict[str, Callable] = {"ep": ep_factors, "variational": variational_factors, "laplace": laplace_factors}
 
 
 def new_factors(terms: EntryTerms, factors: Factors, marginals: FactorMarginals, settings: FactorSettings,
@@ -79,7 +79,7 @@ def new_factors(terms: EntryTerms, factors: Factors, marginals: FactorMarginals,
         damping: fraction of the new factors that is taken.
         is_coarse: whether EP uses the coarse quadrature.
     """
-    nu, tau, log_partition = _NEW_SITES[settings.method](terms, factors, marginals, settings.power, is_coarse)
+    nu, tau, log_partition = _NEW_FACTORS[settings.method](terms, factors, marginals, settings.power, is_coarse)
     nu, tau = (jnp.where(marginals.deterministic, 0.0, new) for new in (nu, tau))
     usable = terms.present & marginals.valid & jnp.isfinite(nu) & jnp.isfinite(tau)
     nu, tau = (jnp.where(usable, new, old) for new, old in ((nu, factors.nu), (tau, factors.tau)))

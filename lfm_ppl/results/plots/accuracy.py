@@ -17,10 +17,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lfm_ppl.accuracy.report import AccuracyReport
-from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.plots.chains import known_truth, parameter_units
-from lfm_ppl.results.scalars import choose, scalar_draws
+from lfm_ppl.results.result_view import ResultView
+from lfm_ppl.results.scalars import choose
 
 MAX_PANELS = 11
 _BELOW = -30.0
@@ -49,10 +48,10 @@ def plot_accuracy(result: Any, parameters: Sequence[str] | None = None, *, width
     Raises:
         ValueError: there is no report, or a parameter is unknown.
     """
-    report = AccuracyReport.of(result)
-    draws = scalar_draws(group(result, "posterior"))
+    view = ResultView.of(result)
+    report, draws = AccuracyReport.of(view), view.draws
     labels, note = style.first_of(choose(draws, parameters), parameters, MAX_PANELS, "parameters")
-    truth, units, table = known_truth(result), parameter_units(result), report.table
+    truth, units, table = view.truth, view.units, report.table
     columns = 2 if style.is_narrow(width) else 3
     rows = math.ceil((len(labels) + 1) / columns)
     figure = style.new_figure(width, 1.2 * rows + 0.6)
@@ -62,7 +61,7 @@ def plot_accuracy(result: Any, parameters: Sequence[str] | None = None, *, width
     for axes in panels[: len(labels) + 1]:
         style.tidy(axes, x_ticks=3, y_ticks=3)
     _draw_ratios(panels[0], report)
-    checked_columns = np.searchsorted(group(result, "posterior")["draw"].values, report.dataset["draw"].values)
+    checked_columns = np.searchsorted(view.posterior["draw"].values, report.dataset["draw"].values)
     weight = np.exp(report.log_weight).ravel()
     line = {"ls": "-", "label": "corrected posterior"} if report.reliable else {
         "ls": (0, (2.5, 1.2)), "label": "corrected posterior, not reliable"}

@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy import stats
 
-from lfm_ppl.results.arviz_data import group, has_group
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.scalars import choose, sampled, scalar_draws, scalar_truth, unit_of
+from lfm_ppl.results.result_view import ResultView
+from lfm_ppl.results.scalars import choose, sampled
 
 MAX_ROWS = 8
 
@@ -52,8 +52,9 @@ def plot_trace(result: Any, parameters: Sequence[str] | None = None, *, width: s
         >>> len(plot_trace(build({"posterior": posterior}), ["decay[0]"]).axes)
         2
     """
-    draws, labels, note = parameters_to_draw(result, parameters, MAX_ROWS)
-    truth, units, diverging = known_truth(result), parameter_units(result), divergences(result)
+    view = ResultView.of(result)
+    labels, note = parameters_to_draw(view, parameters, MAX_ROWS)
+    draws, truth, units, diverging = view.draws, view.truth, view.units, view.divergences
     narrow = style.is_narrow(width)
     figure = style.new_figure(width, (0.82 if narrow else 0.95) * len(labels) + 0.75)
     rows = figure.subplots(len(labels), 2, squeeze=False, sharex="col", gridspec_kw={"width_ratios": [1.6, 1.0]})
@@ -78,43 +79,13 @@ def plot_trace(result: Any, parameters: Sequence[str] | None = None, *, width: s
     return figure
 
 
-def parameters_to_draw(result: Any, names: Sequence[str] | None,
-                       limit: int) -> tuple[dict[str, np.ndarray], list[str], str]:
-    """Return all scalar draws, the labels to draw, and a remark where some are left out."""
-    posterior = group(result, "posterior")
-    draws = scalar_draws(posterior)
-    selected = sampled(posterior) if names is None else choose(draws, names)
+def parameters_to_draw(view: ResultView, names: Sequence[str] | None, limit: int) -> tuple[list[str], str]:
+    """Return the labels of the scalars to draw, and a remark where some are left out."""
+    selected = sampled(view.posterior) if names is None else choose(view.draws, names)
     if not selected:
         raise ValueError("no parameter varies in the posterior, so there is nothing to draw; known: "
-                         f"{', '.join(draws) or 'none'}.")
-    return draws, *style.first_of(selected, names, limit, "parameters")
-
-
-def known_truth(result: Any) -> dict[str, float]:
-    """Return the true values of scalar parameters, by label; empty where none are known."""
-    if not has_group(result, "truth"):
-        return {}
-    return scalar_truth(group(result, "posterior"), group(result, "truth"))
-
-
-def parameter_units(result: Any) -> dict[str, str]:
-    """Return the unit of each scalar parameter, by label; empty where it is not known."""
-    posterior = group(result, "posterior")
-    units = {}
-    for name in posterior.data_vars:
-        for label in scalar_draws(posterior[[name]]):
-            entry = label.partition("[")[2].removesuffix("]")
-            units[label] = unit_of(posterior[name], entry)
-    return units
-
-
-def divergences(result: Any) -> np.ndarray:
-    """Return which draws ended a divergent transition, shape (chain, draw)."""
-    if has_group(result, "sample_stats") and "diverging" in group(result, "sample_stats"):
-        diverging = group(result, "sample_stats")["diverging"]
-        return diverging.transpose("chain", "draw").values.astype(bool)
-    sizes = group(result, "posterior").sizes
-    return np.zeros((sizes["chain"], sizes["draw"]), bool)
+                         f"{', '.join(view.draws) or 'none'}.")
+    return style.first_of(selected, names, limit, "parameters")
 
 
 _DIVERGENT: dict[str, Any] = {"color": style.VERMILLION, "marker": "|", "ms": 5, "mew": 1.0}

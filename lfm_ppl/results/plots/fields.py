@@ -9,10 +9,9 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfm_ppl.results.arviz_data import group
 from lfm_ppl.results.fields import GROUP, evaluate_field
-from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import style
+from lfm_ppl.results.result_view import ResultView
 
 _SNAPSHOTS = (0.1, 0.5, 0.9)
 """Shares of the times before the snapshots."""
@@ -47,12 +46,13 @@ def plot_field(result: Any, field: Any, points: Any = None, *, width: str | floa
         >>> plot_field(result, lfm.LaplaceBasis((0.0, 1.0), 3), sensors=[0.5], name="heat").axes[0].get_ylabel()
         'place'
     """
-    dataset = (group(result, f"{GROUP}{field}") if isinstance(field, str)
-               else evaluate_field(result, field, points, **options))
+    view = ResultView.of(result)
+    dataset = (view.group(f"{GROUP}{field}") if isinstance(field, str)
+               else evaluate_field(view, field, points, **options))
     dataset = dataset.isel(place=np.lexsort(dataset["r"].values.T))
     kinds = [kind for kind in _COLOURS if kind in dataset]
     snapshots = dataset.isel(at=[round(share * (dataset.sizes["at"] - 1)) for share in _SNAPSHOTS])
-    titles = [f"t = {time:.3g} {time_unit(result)}".strip() for time in snapshots["at"].values]
+    titles = [f"t = {time:.3g} {view.time_unit}".strip() for time in snapshots["at"].values]
     if dataset.sizes["axis"] == 1:
         figure = style.new_figure(width, 1.15 * len(kinds) + 2.0)
         grid = figure.add_gridspec(len(kinds) + 1, len(titles), height_ratios=[1.0] * len(kinds) + [1.25])
@@ -60,7 +60,7 @@ def plot_field(result: Any, field: Any, points: Any = None, *, width: str | floa
             axes = figure.add_subplot(grid[row, :])
             _draw_against_time(figure, axes, dataset, kind)
             axes.tick_params(labelbottom=row + 1 == len(kinds))
-        style.label_time([axes], time_unit(result), time_origin(result))
+        style.label_time([axes], view.time_unit, view.time_origin)
         bands: list[Axes] = []
         for column, title in enumerate(titles):
             bands.append(figure.add_subplot(grid[-1, column], sharey=bands[0] if bands else None))

@@ -8,19 +8,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from lfm_ppl.results import arviz_data
-from lfm_ppl.results.arviz_data import group, has_group
 from lfm_ppl.results.inputs import FORECAST
 from lfm_ppl.results.inputs import GROUP as CONSTANT
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, INTERVAL, MEAN, interval, noise_free_interval
-from lfm_ppl.results.series import ENTRY, times_of
+from lfm_ppl.results.result_view import ENTRY, ResultView
+from lfm_ppl.results.series import times_of
 
 NOISE_FREE, PREDICTIVE = "#8FBFDE", "#D3E4F1"
 """Tints of blue: bands of noise-free outputs and of new data."""
@@ -33,80 +31,78 @@ _SMALLEST_SHARE, _FEWEST_ROWS = 0.2, 20
 """Share of the axis below which a forecast gets a third of it, and rows that are shown before it at least."""
 
 
-def series_predictions(result: Any) -> xr.Dataset | None:
+def series_predictions(view: ResultView) -> xr.Dataset | None:
     """Return the predictions of one series, or of all series of a panel; None where there are none."""
-    if not has_group(result, GROUP):
+    if (dataset := view.groups.get(GROUP)) is None:
         return None
-    dataset = group(result, GROUP)
     return dataset.drop_duplicates("time") if "time" in dataset.indexes else dataset
 
 
-def forecast_span(result: Any) -> tuple[float, float]:
+def forecast_span(view: ResultView) -> tuple[float, float]:
     """Return the times of the last observation and of the last prediction; minus infinity without predictions."""
-    predicted = series_predictions(result)
+    predicted = series_predictions(view)
     if predicted is None or predicted.sizes["time"] == 0:
         return -np.inf, -np.inf
     end = float(times_of(predicted).values.max())
     return float(predicted.attrs.get("last_observation", end)), end
 
 
-def is_made_later(result: Any) -> bool:
+def is_made_later(view: ResultView) -> bool:
     """Return whether the predictions reach beyond the data and the trajectories of the fit."""
-    last, end = forecast_span(result)
-    return last < end and not (has_group(result, "trajectories") and
-                               times_of(group(result, "trajectories"), "at").values.max() >= end)
+    last, end = forecast_span(view)
+    return last < end and not ("trajectories" in view.groups and
+                               times_of(view.groups["trajectories"], "at").values.max() >= end)
 
 
-def without_forecast(result: Any) -> Any:
+def without_forecast(view: ResultView) -> ResultView:
     """Return the result as the fit left it, without a forecast that was made later."""
-    if not is_made_later(result):
-        return result
-    return arviz_data.build({name: group(result, name) for name in arviz_data.groups(result)
-                             if name not in (GROUP, HELD_OUT, FORECAST)}, arviz_data.attributes(result))
+    if not is_made_later(view):
+        return view
+    return view.with_groups({name: dataset for name, dataset in view.groups.items()
+                             if name not in (GROUP, HELD_OUT, FORECAST)})
 
 
-def forecast_window(result: Any) -> tuple[float, float] | None:
+def forecast_window(view: ResultView) -> tuple[float, float] | None:
     """Return the interval of time to show of a result with a forecast; None: everything."""
-    if not is_made_later(result) or not has_group(result, "data"):
+    if not is_made_later(view) or "data" not in view.groups:
         return None
-    last, end = forecast_span(result)
-    times = group(result, "data")["time"].values
+    last, end = forecast_span(view)
+    times = view.groups["data"]["time"].values
     start = min(last - 2.0 * (end - last), times[-_FEWEST_ROWS:][0])
-    if has_group(result, "trajectories"):
-        start = min(start, group(result, "trajectories")["at"].values[-_FEWEST_ROWS:][0])
+    if "trajectories" in view.groups:
+        start = min(start, view.groups["trajectories"]["at"].values[-_FEWEST_ROWS:][0])
     return None if end - last >= _SMALLEST_SHARE * (end - times[0]) or start <= times[0] else (start, end)
 
 
-def recent_part(result: Any) -> tuple[Any, str]:
+def recent_part(view: ResultView) -> tuple[ResultView, str]:
     """Return the result within `forecast_window`, and a remark where rows are left out."""
-    window = forecast_window(result)
+    window = forecast_window(view)
     if window is None:
-        return result, ""
-    times = group(result, "data")["time"].values
+        return view, ""
+    times = view.groups["data"]["time"].values
     groups = {}
-    for name in arviz_data.groups(result):
-        groups[name] = group(result, name)
+    for name, dataset in view.groups.items():
         # Known inputs have times of their own, such as ``dose_time``, and resets.
-        clocks = [clock for clock in groups[name].dims if clock in ("time", "at", "at_truth") or
+        clocks = [clock for clock in dataset.dims if clock in ("time", "at", "at_truth") or
                   name in (CONSTANT, FORECAST) and str(clock).endswith(("_time", "_reset"))]
-        groups[name] = groups[name].isel({clock: groups[name][clock].values >= window[0] for clock in clocks})
-        if ENTRY in groups[name].dims:
-            groups[name] = groups[name].isel({ENTRY: groups[name]["time"].values >= window[0]})
+        groups[name] = dataset.isel({clock: dataset[clock].values >= window[0] for clock in clocks})
+        if ENTRY in dataset.dims:
+            groups[name] = groups[name].isel({ENTRY: dataset["time"].values >= window[0]})
     remark = f"The last {(times >= window[0]).sum()} of {len(times)} rows of data and the forecast."
-    return arviz_data.build(groups, arviz_data.attributes(result)), remark
+    return view.with_groups(groups), remark
 
 
-def mark_last_observation(axes: Axes, result: Any) -> None:
+def mark_last_observation(axes: Axes, view: ResultView) -> None:
     """Mark the last observation where predictions follow it."""
-    last, end = forecast_span(result)
+    last, end = forecast_span(view)
     if last < end:
         axes.axvline(last, color=style.GREY, lw=0.8, ls=(0, (1, 2)), zorder=2.5, label="last observation")
 
 
-def draw_held_out(axes: Axes, result: Any, name: str) -> None:
+def draw_held_out(axes: Axes, view: ResultView, name: str) -> None:
     """Draw the data that the predictions of an output were compared with."""
-    if has_group(result, HELD_OUT):
-        values = group(result, HELD_OUT)["y"].sel(output=name)
+    if HELD_OUT in view.groups:
+        values = view.groups[HELD_OUT]["y"].sel(output=name)
         axes.plot(values["time"], values, color=style.BLACK, ls="", marker="o", ms=2.6, mfc="white", mew=0.6, zorder=4,
                   label="held-out data")
 

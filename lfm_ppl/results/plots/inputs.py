@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lfm_ppl.io.data_set import InputTable
-from lfm_ppl.results.inputs import FORECAST, input_unit, inputs_of
 from lfm_ppl.results.plots import forecasts, style
 from lfm_ppl.results.plots.trajectories import MAX_PANELS, finish
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.utils.checks import one_of
 
 _MANY = 150  # values, from which they have no marks
@@ -44,7 +44,8 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
         >>> [axes.get_ylabel() for axes in plot_inputs(build({GROUP: to_dataset({"heater": heater})})).axes]
         ['heater']
     """
-    tables = {**inputs_of(result), **inputs_of(result, FORECAST)}
+    view = ResultView.of(result)
+    tables = view.inputs | view.forecast_inputs
     if not tables:
         raise ValueError("the result holds no known inputs. Give them as columns of the data file, or in "
                          "lfm.Data(..., inputs=...).")
@@ -53,18 +54,18 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
         one_of("input", name, tables)
     names, note = style.first_of(selected, inputs, MAX_PANELS, "inputs")
     figure, panels = style.small_multiples(width, len(names), 1.25)
-    _, end = forecasts.forecast_span(result)
+    _, end = forecasts.forecast_span(view)
     for axes, name in zip(panels, names, strict=True):
         table = tables[name]
         if table.is_dose:
             _draw_doses(axes, table)
         else:
             _draw_function(axes, table, end)
-        forecasts.mark_last_observation(axes, result)
-        style.label_values(axes, name, input_unit(result, name))
-    if window := forecasts.forecast_window(result):
+        forecasts.mark_last_observation(axes, view)
+        style.label_values(axes, name, view.input_unit(name))
+    if window := forecasts.forecast_window(view):
         panels[0].set_xlim(window)
-    finish(figure, panels, result, note)
+    finish(figure, panels, view, note)
     return figure
 
 

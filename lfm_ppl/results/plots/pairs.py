@@ -15,7 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lfm_ppl.results.plots import style
-from lfm_ppl.results.plots.chains import divergences, known_truth, parameter_units, parameters_to_draw
+from lfm_ppl.results.plots.chains import parameters_to_draw
+from lfm_ppl.results.result_view import ResultView
 
 _SMALLEST, _MARGIN = 0.77, 0.8  # inches: a panel that holds its labels, the room beside them
 MAX_POINTS = 2000
@@ -50,14 +51,15 @@ def plot_pairs(result: Any, parameters: Sequence[str] | None = None, *, width: s
         3
     """
     limit = max(int((style.inches(width) - _MARGIN) / _SMALLEST), 1)
-    draws, labels, note = parameters_to_draw(result, parameters, limit)
+    view = ResultView.of(result)
+    labels, note = parameters_to_draw(view, parameters, limit)
     count = len(labels)
     if count > limit:
         raise ValueError(f"{count} parameters do not fit into {style.inches(width):g} inches; name at most {limit}, or "
                          f"pass width={math.ceil(count * _SMALLEST + _MARGIN)}.")
-    truth, units = known_truth(result), parameter_units(result)
-    diverging = divergences(result).ravel()
-    flat = [draws[label].ravel() for label in labels]
+    truth, units = view.truth, view.units
+    diverging = view.divergences.ravel()
+    flat = [view.draws[label].ravel() for label in labels]
     panel = min((style.inches(width) - _MARGIN) / count, 1.5)
     figure = style.new_figure(width, panel * count + 0.9)
     grid = figure.subplots(count, count, squeeze=False, sharex="col")

@@ -19,11 +19,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from lfm_ppl.results.arviz_data import group
-from lfm_ppl.results.inputs import time_origin, time_unit
 from lfm_ppl.results.plots import style
 from lfm_ppl.results.plots.trajectories import finish, pick, series_views
 from lfm_ppl.results.residuals import autocorrelation, default_lags, mean_residuals, normal_scores, residual_tests
+from lfm_ppl.results.result_view import ResultView
 
 MAX_OUTPUTS = 4
 _ENVELOPE = "#DDDDDD"
@@ -61,23 +60,24 @@ def plot_residuals(result: Any, outputs: Sequence[str] | None = None, *, series:
         >>> [axes.get_title(loc="left") for axes in figure.axes]
         ['position', 'KS p = 0.56', 'Ljung-Box p = 0.11']
     """
-    residual = group(result, "one_step_ahead")["residual"]
+    view = ResultView.of(result)
+    residual = view.group("one_step_ahead")["residual"]
     names, note = style.first_of(pick(residual, "output", outputs), outputs, MAX_OUTPUTS, "outputs")
-    views, remark = series_views(result, series, len(names))
+    views, remark = series_views(view, series, len(names))
     note = f"{remark} {note}"
     if len(views) > 1:
         return _draw_series(views, names, note, width)
-    ((title, result),) = views.items()
-    means, tests = mean_residuals(result), residual_tests(result)
+    ((title, view),) = views.items()
+    means, tests = mean_residuals(view), residual_tests(view)
     figure, rows = _panels(width, len(names))
     for name, (over_time, quantiles, lags) in zip(names, rows, strict=True):
         values = means.sel(output=name)
-        _draw_over_time(over_time, result, name)
+        _draw_over_time(over_time, view, name)
         over_time.set_title(f"{title}, {name}" if title else name, fontweight="bold")
         over_time.set_ylabel("residual (sd)")
         _draw_quantiles(quantiles, values.values, tests.loc[name])
         _draw_autocorrelation(lags, values.values, tests.loc[name])
-    style.label_time([row[0] for row in rows], time_unit(result), time_origin(result))
+    style.label_time([row[0] for row in rows], view.time_unit, view.time_origin)
     for row in rows if style.is_narrow(width) else rows[-1:]:
         row[1].set_xlabel("normal quantile")
         row[2].set_xlabel("lag (observations)")
@@ -86,7 +86,7 @@ def plot_residuals(result: Any, outputs: Sequence[str] | None = None, *, series:
     return figure
 
 
-def _draw_series(views: Mapping[str, Any], names: Sequence[str], note: str, width: str | float) -> Figure:
+def _draw_series(views: Mapping[str, ResultView], names: Sequence[str], note: str, width: str | float) -> Figure:
     """Draw the residuals over time of each output of each series."""
     figure, panels = style.small_multiples(width, len(views) * len(names), 1.25)
     for axes, (name, (title, view)) in zip(panels, itertools.product(names, views.items()), strict=True):
@@ -116,10 +116,10 @@ def _panels(width: str | float, count: int) -> tuple[Figure, list[tuple[Axes, Ax
     return figure, rows
 
 
-def _draw_over_time(axes: Axes, result: Any, name: str) -> None:
+def _draw_over_time(axes: Axes, view: ResultView, name: str) -> None:
     """Draw the residuals of an output over time, of a result of one series."""
-    draws = group(result, "one_step_ahead")["residual"].transpose("chain", "draw", "time", "output").sel(output=name)
-    series = mean_residuals(result).sel(output=name)
+    draws = view.group("one_step_ahead")["residual"].transpose("chain", "draw", "time", "output").sel(output=name)
+    series = mean_residuals(view).sel(output=name)
     times = series["time"].values
     axes.axhspan(-1.96, 1.96, color=_ENVELOPE, lw=0, zorder=0, label="95% if the model holds")
     axes.axhline(0.0, color=style.GREY, lw=0.6, zorder=1)

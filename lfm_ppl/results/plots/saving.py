@@ -11,12 +11,10 @@ from typing import Any
 from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 
-from lfm_ppl.results.arviz_data import group, groups, has_group, of_mode, refuse_several_sites
 from lfm_ppl.results.fields import GROUP as FIELD
-from lfm_ppl.results.inputs import inputs_of
 from lfm_ppl.results.plots import accuracy, chains, fields, forecasts, inputs, pairs, residuals, trajectories
+from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.scalars import sampled
-from lfm_ppl.results.series import series_dimension, series_labels
 from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
 
 MAX_PAGES = 5
@@ -68,12 +66,13 @@ def save_figures(result: Any, folder: str | Path, formats: Sequence[str] = ("png
     for ending in formats:
         if ending not in supported:
             raise ValueError(f"unknown figure format {ending!r}; known: {', '.join(supported)}.")
-    pages = list(pages_of(result, width))
+    view = ResultView.of(result)
+    pages = list(pages_of(view, width))
     paths = [Path(folder) / f"{name}.{ending}" for name, _, _ in pages for ending in formats]
     for path in paths:
         refuse_existing(path, overwrite)
     for name, draw, names in pages:
-        figure = draw(result, names, width=width)
+        figure = draw(view, names, width=width)
         figure.set_layout_engine("none")  # laid out already; each format would do it again
         for ending in formats:
             with atomic_write(Path(folder) / f"{name}.{ending}", overwrite) as temporary:
@@ -83,33 +82,33 @@ def save_figures(result: Any, folder: str | Path, formats: Sequence[str] = ("png
 
 def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, Any]]:
     """Yield file name, function and the names to draw, for each page of each figure."""
-    refuse_several_sites(result)
-    later = forecasts.is_made_later(result)
-    series = [] if series_dimension(result) is None else series_labels(result)
+    view = ResultView.of(result)
+    view.refuse_several_sites()
+    later, series = forecasts.is_made_later(view), view.series_labels
     for prefix in ("", "forecast-") if later else ("",):
         for kind, draw in _OVER_TIME.items():
-            names = (list(inputs_of(result)) if kind == "inputs" else
-                     trajectories.trajectory_names(result, "output" if kind == "fit" else kind.removesuffix("s")))
-            if kind == "fit" and not has_group(result, "data"):
+            names = (list(view.inputs) if kind == "inputs" else
+                     view.trajectory_names("output" if kind == "fit" else kind.removesuffix("s")))
+            if kind == "fit" and "data" not in view.groups:
                 continue
             title = f"{prefix}{kind}".replace("forecast-fit", "forecast")
             draw = draw if prefix or not later else _of_the_fit(draw)
             yield from _pages(title, draw, names, trajectories.MAX_PANELS, series if kind != "inputs" else [])
-    for name in (name.removeprefix(FIELD) for name in groups(result) if name.startswith(FIELD)):
+    for name in (name.removeprefix(FIELD) for name in view.groups if name.startswith(FIELD)):
         yield f"field-{name}", fields.plot_field, name
-    if has_group(result, "posterior"):
-        labels = sampled(group(result, "posterior"))
-        if not of_mode(result):  # independent draws have no chains to look at
+    if "posterior" in view.groups:
+        labels = sampled(view.posterior)
+        if not view.is_about_mode:  # independent draws have no chains to look at
             yield from _numbered("trace", chains.plot_trace, labels, chains.MAX_ROWS)
         if labels:
             # Pages would miss most pairs; the figure itself says how to choose others.
             yield "pairs", pairs.plot_pairs, None
-    if has_group(result, "one_step_ahead"):
-        residual = group(result, "one_step_ahead")["residual"]
+    if "one_step_ahead" in view.groups:
+        residual = view.groups["one_step_ahead"]["residual"]
         # An observation family may not know the probabilities that residuals are made of.
         names = [str(name) for name in residual["output"].values if residual.sel(output=name).notnull().any()]
         yield from _pages("residuals", residuals.plot_residuals, names, residuals.MAX_OUTPUTS, series)
-    if has_group(result, "accuracy"):
+    if "accuracy" in view.groups:
         yield "accuracy", accuracy.plot_accuracy, None
 
 
@@ -117,8 +116,8 @@ def _of_the_fit(draw: Draw) -> Draw:
     """Return the function of a figure without the forecast, which has figures of its own."""
 
     @functools.wraps(draw)
-    def wrapper(result: Any, *args: Any, **kwargs: Any) -> Figure:
-        return draw(forecasts.without_forecast(result), *args, **kwargs)
+    def wrapper(view: ResultView, *args: Any, **kwargs: Any) -> Figure:
+        return draw(forecasts.without_forecast(view), *args, **kwargs)
 
     return wrapper
 
@@ -131,8 +130,8 @@ def _pages(title: str, draw: Draw, names: list[str], size: int,
         return
 
     @functools.wraps(draw)
-    def draw_series(result: Any, page: Sequence[Any], **options: Any) -> Figure:
-        return draw(result, names[:size], series=page, **options)
+    def draw_series(view: ResultView, page: Sequence[Any], **options: Any) -> Figure:
+        return draw(view, names[:size], series=page, **options)
 
     yield from _numbered(title, draw_series, series, trajectories.MAX_PANELS // min(size, len(names)))
 

@@ -18,12 +18,11 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfm_ppl.results.arviz_data import group, has_group, refuse_several_sites
-from lfm_ppl.results.inputs import FORECAST, inputs_of, time_origin, time_unit
 from lfm_ppl.results.plots import forecasts, style
 from lfm_ppl.results.predictions import INTERVAL, PERIODS, REGIMES, SHOWN_PERIODS, quantiles, repeats_often
+from lfm_ppl.results.result_view import ENTRY, ResultView
 from lfm_ppl.results.scalars import unit_of
-from lfm_ppl.results.series import ENTRY, select_series, series_dimension, series_labels
+from lfm_ppl.results.series import series_view
 from lfm_ppl.utils.checks import one_of
 
 MAX_PANELS = 12
@@ -75,10 +74,11 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any =
         >>> figure.axes[0].get_ylabel()
         'mRNA (nM)'
     """
-    refuse_several_sites(result)
-    observed = group(result, "data")["y"]
+    view = ResultView.of(result)
+    view.refuse_several_sites()
+    observed = view.group("data")["y"]
     names, note = style.first_of(pick(observed, "output", outputs), outputs, MAX_PANELS, "outputs")
-    parts, remark = recent_series(result, series, len(names))
+    parts, remark = recent_series(view, series, len(names))
     figure, panels = style.small_multiples(width, len(parts) * len(names), 1.35)
     for axes, (name, (title, part)) in zip(panels, itertools.product(names, parts.items()), strict=True):
         _draw_output(axes, part, name)
@@ -88,7 +88,7 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any =
         forecasts.draw_held_out(axes, part, name)
         _draw_events(axes, part)
         style.label_values(axes, name, unit_of(observed, name), title)
-    finish(figure, panels, result, f"{remark} {note}")
+    finish(figure, panels, view, f"{remark} {note}")
     return figure
 
 
@@ -118,7 +118,7 @@ def plot_forces(result: Any, forces: Sequence[str] | None = None, *, series: Any
         >>> [axes.get_ylabel() for axes in figure.axes]
         ['p53']
     """
-    return _draw_kind(result, "force", forces, series, width, (style.GREEN, _FORCE))
+    return _draw_kind(ResultView.of(result), "force", forces, series, width, (style.GREEN, _FORCE))
 
 
 @style.styled
@@ -148,7 +148,7 @@ def plot_states(result: Any, states: Sequence[str] | None = None, *, series: Any
         >>> [axes.get_ylabel() for axes in plot_states(build({"trajectories": draws})).axes]
         ['x', 'v']
     """
-    return _draw_kind(result, "state", states, series, width, (style.BLUE, forecasts.NOISE_FREE))
+    return _draw_kind(ResultView.of(result), "state", states, series, width, (style.BLUE, forecasts.NOISE_FREE))
 
 
 @style.styled
@@ -176,14 +176,7 @@ def plot_deterministics(result: Any, names: Sequence[str] | None = None, *, seri
         >>> [axes.get_ylabel() for axes in plot_deterministics(build({"trajectories": draws})).axes]
         ['uptake']
     """
-    return _draw_kind(result, "deterministic", names, series, width, (style.ORANGE, _DETERMINISTIC))
-
-
-def trajectory_names(result: Any, kind: str) -> list[str]:
-    """Return the names of the forces, states, deterministics or outputs that ``result`` has trajectories of."""
-    if not has_group(result, "trajectories") or kind not in group(result, "trajectories").dims:
-        return []
-    return [str(name) for name in group(result, "trajectories")[kind].values]
+    return _draw_kind(ResultView.of(result), "deterministic", names, series, width, (style.ORANGE, _DETERMINISTIC))
 
 
 def pick(variable: xr.DataArray, kind: str, selection: Sequence[str] | None) -> list[str]:
@@ -199,45 +192,45 @@ def pick(variable: xr.DataArray, kind: str, selection: Sequence[str] | None) -> 
     return selection
 
 
-def series_views(result: Any, series: Any, count: int) -> tuple[dict[str, Any], str]:
+def series_views(view: ResultView, series: Any, count: int) -> tuple[dict[str, ResultView], str]:
     """Return the series of a panel to draw, and a remark where some are left out.
 
     Args:
-        result: of a panel, or of one series.
+        view: of a panel, or of one series.
         series: labels or positions; None for all, as many as have room.
         count: number of axes of each series.
 
     Returns:
-        Title -> result of one series; without a title where ``result`` is of one.
+        Title -> view of one series; without a title where ``view`` is of one.
     """
-    if series_dimension(result) is None:
+    if view.series_dimension is None:
         if series is not None:
             raise ValueError("series selects series of a panel, and the result is of one series; leave it out.")
-        return {"": result}, ""
-    labels = series_labels(result) if series is None else [series] if np.ndim(series) == 0 else list(series)
+        return {"": view}, ""
+    labels = view.series_labels if series is None else [series] if np.ndim(series) == 0 else list(series)
     labels, note = style.first_of(labels, series, max(1, MAX_PANELS // count), "series")
-    views = [select_series(result, label) for label in labels]
-    return {view.attrs["selected"]: view for view in views}, note
+    members = [series_view(view, label) for label in labels]
+    return {member.attrs["selected"]: member for member in members}, note
 
 
-def recent_series(result: Any, series: Any, count: int) -> tuple[dict[str, Any], str]:
+def recent_series(view: ResultView, series: Any, count: int) -> tuple[dict[str, ResultView], str]:
     """Return `series_views` within the window of a forecast, and a remark."""
-    views, note = series_views(result, series, count)
-    parts = {title: forecasts.recent_part(view) for title, view in views.items()}
+    views, note = series_views(view, series, count)
+    parts = {title: forecasts.recent_part(member) for title, member in views.items()}
     remarks = {remark for _, remark in parts.values() if remark}
     if len(remarks) > 1:
         remarks = {"The last rows of data and the forecast."}
     return {title: part for title, (part, _) in parts.items()}, " ".join([*remarks, note])
 
 
-def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, series: Any, width: str | float,
+def _draw_kind(view: ResultView, kind: str, selection: Sequence[str] | None, series: Any, width: str | float,
                colours: tuple[str, str]) -> Figure:
     """Draw a panel for each force, state or deterministic, its mean and band in the two ``colours``."""
-    draws = _trajectories(result, kind)
+    draws = _trajectories(view, kind)
     names, note = style.first_of(pick(draws, kind, selection), selection, MAX_PANELS, f"{kind}s")
     regimes = [name for name in json.loads(draws.attrs.get(REGIMES, "[]")) if name in names]
     names = [name for name in names if name not in regimes] + [_PROBABILITY] * bool(regimes)
-    parts, remark = recent_series(result, series, len(names))
+    parts, remark = recent_series(view, series, len(names))
     windows = {name: window for part in parts.values() for name, window in _season_windows(
         _trajectories(part, kind), forecasts.forecast_span(part)[1]).items()}
     figure, panels = style.small_multiples(width, len(parts) * len(names), 1.25, not set(windows) & set(names))
@@ -259,24 +252,24 @@ def _draw_kind(result: Any, kind: str, selection: Sequence[str] | None, series: 
         style.label_values(axes, name, unit_of(draws, name), title)
     shortened = [name for name in names if name in windows]
     periods = f"Of {', '.join(shortened)} {SHOWN_PERIODS} periods at the end of the data." if shortened else ""
-    finish(figure, panels, result, f"{remark} {periods} {note}")
+    finish(figure, panels, view, f"{remark} {periods} {note}")
     return figure
 
 
-def _draw_regimes(axes: Axes, result: Any, paths: xr.DataArray | None, regimes: Sequence[str], title: str) -> None:
+def _draw_regimes(axes: Axes, view: ResultView, paths: xr.DataArray | None, regimes: Sequence[str], title: str) -> None:
     """Draw the probabilities of the regimes as areas, with their predictions (chain, draw, time, state) or None."""
-    probability = _trajectories(result, "state").sel(state=list(regimes)).mean(["chain", "draw"])
+    probability = _trajectories(view, "state").sel(state=list(regimes)).mean(["chain", "draw"])
     times = probability["at"].values
     if paths is not None:
         later = paths.sel(state=list(regimes), time=paths["time"] > times[-1]).mean(["chain", "draw"])
         probability = xr.concat([probability, later.rename(time="at")], "at", coords="minimal", compat="override")
-        forecasts.mark_last_observation(axes, result)
+        forecasts.mark_last_observation(axes, view)
     colours = dict(zip(regimes, itertools.cycle(style.CHAIN_COLOURS), strict=False))
     axes.stackplot(probability["at"].values, probability.transpose("state", "at").values, labels=regimes, lw=0,
                    colors=colours.values(), alpha=0.6)
     ticks = {0.0: "0", 0.5: "0.5", 1.0: "1"}
     for regime, colour in colours.items():
-        truth = _true_path(axes, result, "state", regime)
+        truth = _true_path(axes, view, "state", regime)
         if truth is not None:
             axes.fill_between(truth[0], 1.05, 1.05 + 0.1 * truth[1], step="mid", color=colour, lw=0)
             ticks[1.1] = "truth"
@@ -292,16 +285,16 @@ def _season_windows(draws: xr.DataArray, end: float) -> dict[str, tuple[float, f
             for name, period in periods.items() if repeats_often(period, max(end, times[-1]) - times[0])}
 
 
-def finish(figure: Figure, panels: list[Axes], result: Any, remark: str) -> None:
+def finish(figure: Figure, panels: list[Axes], view: ResultView, remark: str) -> None:
     """Label the time of all panels, and add a legend and a remark."""
-    style.label_time(panels, time_unit(result), time_origin(result))
+    style.label_time(panels, view.time_unit, view.time_origin)
     figure.align_ylabels(panels)
     style.legend_above(figure)
     style.note_below(figure, remark)
 
 
-def _trajectories(result: Any, kind: str) -> xr.DataArray:
-    dataset = group(result, "trajectories")
+def _trajectories(view: ResultView, kind: str) -> xr.DataArray:
+    dataset = view.group("trajectories")
     if f"{kind}s" not in dataset or dataset.sizes[kind] == 0:
         raise ValueError(f"the result holds no {kind} trajectories; its group trajectories has "
                          f"{', '.join(map(str, dataset.data_vars))}. They come from lfm.fit with trajectory_draws "
@@ -309,16 +302,16 @@ def _trajectories(result: Any, kind: str) -> xr.DataArray:
     return dataset[f"{kind}s"].transpose("chain", "draw", ..., "at", kind)
 
 
-def _draw_truth(axes: Axes, result: Any, kind: str, name: str) -> None:
+def _draw_truth(axes: Axes, view: ResultView, kind: str, name: str) -> None:
     """Draw the true trajectory where it is known, as far as the axes are in use."""
-    truth = _true_path(axes, result, kind, name)
+    truth = _true_path(axes, view, kind, name)
     if truth is not None:
         axes.plot(*truth, **style.TRUTH)
 
 
-def _true_path(axes: Axes, result: Any, kind: str, name: str) -> tuple[np.ndarray, np.ndarray] | None:
+def _true_path(axes: Axes, view: ResultView, kind: str, name: str) -> tuple[np.ndarray, np.ndarray] | None:
     """Return times and values of the true trajectory, as far as the axes are in use; None where it is unknown."""
-    truth = group(result, "truth").get(f"{kind}s") if has_group(result, "truth") else None
+    truth = view.groups.get("truth", xr.Dataset()).get(f"{kind}s")
     if truth is None or kind not in truth.dims or name not in truth[kind].values:
         return None
     times, (low, high) = truth["at_truth"].values, axes.dataLim.intervalx
@@ -326,17 +319,17 @@ def _true_path(axes: Axes, result: Any, kind: str, name: str) -> tuple[np.ndarra
     return (times[is_shown], truth.sel({kind: name}).values[is_shown]) if is_shown.any() else None
 
 
-def _draw_output(axes: Axes, result: Any, name: str) -> None:
+def _draw_output(axes: Axes, view: ResultView, name: str) -> None:
     """Draw mean and bands of an output, and what is predicted of it."""
-    predicted = forecasts.series_predictions(result)
+    predicted = forecasts.series_predictions(view)
     predicted = None if predicted is None else predicted.sel(output=[name])
-    if predicted is not None and not has_group(result, "trajectories"):
+    if predicted is not None and "trajectories" not in view.groups:
         return forecasts.draw_outputs(axes, predicted)
-    time, mean, low, high = _band(result, "output", name)
+    time, mean, low, high = _band(view, "output", name)
     is_covered = predicted is not None and set(time.tolist()) <= set(predicted["time"].values.tolist())
-    if predicted is not None and is_covered and _summary(result, "outputs") is None:
+    if predicted is not None and is_covered and _summary(view, "outputs") is None:
         return forecasts.draw_outputs(axes, predicted)
-    outer = _draw_new_data(axes, result, name, predicted if is_covered else None, (time, low, high))
+    outer = _draw_new_data(axes, view, name, predicted if is_covered else None, (time, low, high))
     _draw_band(axes, (time, mean, low, high), style.BLUE, forecasts.NOISE_FREE, "95%, noise-free")
     if predicted is not None and not is_covered:
         later = predicted.isel(time=predicted["time"].values > time[-1])
@@ -352,17 +345,17 @@ def _draw_band(axes: Axes, curves: Sequence[np.ndarray], line: str, tint: str, l
     axes.plot(time, mean, color=line, zorder=3, label="posterior mean")
 
 
-def _draw_new_data(axes: Axes, result: Any, name: str, predicted: xr.Dataset | None,
+def _draw_new_data(axes: Axes, view: ResultView, name: str, predicted: xr.Dataset | None,
                    inner: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[float, float]:
     """Draw the band of new data about ``inner``, times and ends of the noise-free band; return its last ends."""
-    summary, step = _summary(result, "new_data"), None
+    summary, step = _summary(view, "new_data"), None
     band: tuple[np.ndarray, ...]
     if summary is not None:
         band = (inner[0], *summary.sel(output=name).values[1:])
     elif predicted is not None:
         band = forecasts.new_data_band(predicted)
-    elif has_group(result, "posterior_predictive"):
-        draws = group(result, "posterior_predictive")["y"].transpose("chain", "draw", ENTRY)
+    elif "posterior_predictive" in view.groups:
+        draws = view.groups["posterior_predictive"]["y"].transpose("chain", "draw", ENTRY)
         draws = draws.isel({ENTRY: draws["output"].values == name})
         if not draws.sizes[ENTRY]:
             return inner[1][-1], inner[2][-1]
@@ -396,10 +389,10 @@ def _band_of_draws(predictive: xr.DataArray, positions: np.ndarray, low: np.ndar
     return (grid, lower, upper), None
 
 
-def _band(result: Any, kind: str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _band(view: ResultView, kind: str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return times, mean and the ends of the 95% interval of a state, force or output, by its density if known."""
-    draws = _trajectories(result, kind).sel({kind: name})
-    summary = _summary(result, f"{kind}s")
+    draws = _trajectories(view, kind).sel({kind: name})
+    summary = _summary(view, f"{kind}s")
     if summary is not None:
         return draws["at"].values, *summary.sel({kind: name}).values
     flat = draws.values.reshape(-1, draws.sizes["at"])
@@ -407,21 +400,21 @@ def _band(result: Any, kind: str, name: str) -> tuple[np.ndarray, np.ndarray, np
     return draws["at"].values, flat.mean(axis=0), low, high
 
 
-def _summary(result: Any, name: str) -> xr.DataArray | None:
+def _summary(view: ResultView, name: str) -> xr.DataArray | None:
     """Return the summary (statistic, at, ...) of trajectories; None where there are draws alone."""
-    summary = group(result, "trajectories").get(f"{name}_summary")
+    summary = view.group("trajectories").get(f"{name}_summary")
     return None if summary is None else summary.transpose("statistic", "at", ...)
 
 
-def _draw_data(axes: Axes, result: Any, name: str) -> None:
+def _draw_data(axes: Axes, view: ResultView, name: str) -> None:
     """Draw measurements of an output, many of them small, and ticks at the top edge where one is missing.
 
     Rows of a data file that hold a dose or a reset and no measurement are not missing.
     """
-    observed = group(result, "data")["y"]
+    observed = view.group("data")["y"]
     times, values = observed["time"].values, observed.sel(output=name).values
     event_times = [np.append(table.times, [] if table.resets is None else table.resets)
-                   for table in inputs_of(result).values() if table.is_dose]
+                   for table in view.inputs.values() if table.is_dose]
     is_event = np.isin(times, np.concatenate([np.zeros(0), *event_times])) & observed.isnull().all("output").values
     is_missing = np.isnan(values) & ~is_event
     look: dict[str, Any] = {"color": style.BLACK, "ms": 2.6, "mec": "white", "mew": 0.3, "zorder": 4}
@@ -435,9 +428,9 @@ def _draw_data(axes: Axes, result: Any, name: str) -> None:
                   color=style.GREY, marker="|", ms=4, mew=0.8, zorder=5, label="missing")
 
 
-def _draw_events(axes: Axes, result: Any) -> None:
+def _draw_events(axes: Axes, view: ResultView) -> None:
     """Draw marks at the bottom edge at the times of doses and resets, as far as the axes are in use."""
-    tables = [table for table in {**inputs_of(result), **inputs_of(result, FORECAST)}.values() if table.is_dose]
+    tables = [table for table in (view.inputs | view.forecast_inputs).values() if table.is_dose]
     end = axes.dataLim.intervalx[1]
     height: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "zorder": 5}
     marks: dict[str, Any] = {"ls": "", "ms": 3.5, "mew": 0.0}
