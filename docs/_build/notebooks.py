@@ -1,6 +1,6 @@
 """Pages of the executed notebooks, made when the site is built: the repository holds each of them once.
 
-A page has the notebook's text, its code, what the code printed, and its pictures.
+A page has the notebook's text, its code, its output with warnings, and its pictures.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from mkdocs.structure.files import File
 
 FOLDER = "gallery"
 _ESCAPES = re.compile(r"\x1b\[[0-9;]*m")
+_KERNEL_FILE = re.compile(r"^/\S*/ipykernel_\d+/\d+\.py:\d+: ", re.MULTILINE)
+"""The temporary file of a cell, with which a warning on standard error begins."""
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -48,13 +50,12 @@ def _parts(cell: dict[str, Any], name: str, pictures: list[bytes]) -> Iterator[s
     yield _fenced(source, "python")
     for output in cell["outputs"]:
         data = output.get("data", {})
-        if output.get("name") == "stderr":
-            continue
         if "image/png" in data:
             pictures.append(base64.b64decode(_joined(data["image/png"])))
             yield f"![Figure {len(pictures)}]({name}_{len(pictures)}.png)"
         elif said := _joined(output.get("text", data.get("text/plain", ""))).strip("\n"):
-            yield _fenced(_ESCAPES.sub("", said), "text")
+            said = _ESCAPES.sub("", said)
+            yield _fenced(_KERNEL_FILE.sub("", said) if output.get("name") == "stderr" else said, "text")
 
 
 def _joined(source: str | list[str]) -> str:
