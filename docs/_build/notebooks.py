@@ -80,9 +80,9 @@ def _cell_parts(cell: dict[str, Any], name: str, heading: str, pictures: list[by
             yield f"![{_plain(heading)}, figure {len(pictures)}]({name}_{len(pictures)}.png)"
         elif table := _TABLE.search(_joined(data.get("text/html", ""))):
             yield "<div>\n" + table[0].replace(_STYLE_OF_PANDAS, "") + "\n</div>"
-        elif said := _joined(output.get("text", data.get("text/plain", ""))).strip("\n"):
-            said = _ESCAPES.sub("", said)
-            yield _fenced(_KERNEL_FILE.sub("", said) if output.get("name") == "stderr" else said, "text")
+        elif text := _joined(output.get("text", data.get("text/plain", ""))).strip("\n"):
+            text = _ESCAPES.sub("", text)
+            yield _fenced(_KERNEL_FILE.sub("", text) if output.get("name") == "stderr" else text, "text")
 
 
 def _plain(heading: str) -> str:
