@@ -28,8 +28,8 @@ DOCS = ROOT / "docs"
 PAGES = {"README": ROOT / "README.md"} | {
     str(path.relative_to(DOCS).with_suffix("")): path for path in sorted(DOCS.rglob("*.md"))}
 COSTLY = {"README", "guide", "ode", "doses", "counts", "space", "regimes", "panels", "many", "forecasts", "numpyro",
-          "observations", "constraints"}
-"""Pages with fits, whose programs take 20 to 70 s to compile."""
+          "observations"}
+"""Pages with fits, whose programs take half a minute or more to compile."""
 
 _FENCE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _INCLUDED = re.compile(r'^--8<-- "([\w./]+)(?::(\w+))?"$', re.MULTILINE)
