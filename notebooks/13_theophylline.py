@@ -16,6 +16,7 @@
 # `lfm-ppl fit pharmacokinetics` with one compartment: gut and blood are amounts in mg per kg of body weight,
 #
 # $$\text{gut}' = -k_a\,\text{gut}, \qquad \text{gut} \leftarrow \text{gut} + \text{dose at } t = 0,$$
+#
 # $$\text{blood}' = k_a\,\text{gut} - \frac{CL}{V}\,\text{blood} + u(t), \qquad
 #   y_k = \text{blood}(t_k) / V + e_k.$$
 #

@@ -1,6 +1,5 @@
 """Public names, and what README, CONTRIBUTING and the site say of them; `mkdocs build --strict` checks the links."""
 
-import functools
 import inspect
 import os
 import re
@@ -71,17 +70,6 @@ def test_files_and_names_that_readme_and_contributing_name_exist():
     assert [name for name in re.findall(r"`([A-Z_]+|_[a-z]+)`", text)
             if not re.search(rf"^(?:def )?{name}\b", sources, re.MULTILINE)] == []
     assert set(re.findall(r"lfm-ppl fit ([a-z][a-z-]*)(?=[\s`])", README)) <= set(loading.available())
-
-
-@pytest.mark.slow
-def test_the_example_of_the_readme_runs(monkeypatch):
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    short = functools.partial(lfm.fit, chains=2, warmup=100, samples=100, progress=False)
-    monkeypatch.setattr(lfm, "fit", short)
-    names: dict = {}
-    exec(code, names)
-    assert 0.0 < float(names["result"]["posterior"]["decay"].mean()) < 5.0
-    assert np.all(np.isfinite(names["result"]["trajectories"]["forces"]))
 
 
 @pytest.mark.slow

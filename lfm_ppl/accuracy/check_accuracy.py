@@ -76,11 +76,11 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         steps: integration steps of the reference between two observations; by default as in the fit.
         model_kwargs: keyword arguments of the model, as in the fit.
         seed: of the particle filter.
-        progress: write to standard error how far it is.
+        progress: show the progress on standard error.
         checkpoint: a folder to keep log likelihoods in while others are computed, every few seconds. They stay there,
             in a folder ``checkpoint``, for whoever takes them up after the report is stored.
-        resume: go on with a check that ``checkpoint`` keeps, of the same result with the same settings; begin one where
-            it keeps none.
+        resume: continue the check in the folder ``checkpoint``, which must be of the same result and settings. In an
+            empty folder a new check starts.
 
     Returns:
         The report; ``print`` it.

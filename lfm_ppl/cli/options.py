@@ -196,7 +196,7 @@ class Inference:
     """Parameters and the sampler of their posterior."""
 
     sampler: Annotated[str, Parameter(choices=tuple(SAMPLERS), metavar="NAME")] = "nuts"
-    """pmmh is ram with the likelihood of a particle filter, exact and slow"""
+    """method; pmmh is ram on the likelihood of a particle filter: exact, but slow"""
     chains: Count = 4
     """number of chains"""
     warmup: CountOrZero | None = None
@@ -398,7 +398,7 @@ class StudyOptions(Output):
     out: Folder | None = None
     """folder to write; results of the same settings that it holds are used again (default: lfm-results/compare/NAME)"""
     quick: bool = False
-    """few and small: it shows that it runs, and no more"""
+    """a few small tasks, to test that the study runs"""
     processes: Annotated[Workers, Parameter(name="*")] = Workers()
 
 

@@ -202,7 +202,7 @@ def breakdown(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: Any, start: M
     stiff = 'method="exponential" for stiff dynamics, ' if METHODS[grid.method].is_explicit else ""
     remedy = ("Try a longest step (max_step=...), more steps (steps=...) where known inputs vary fast, an observation "
               "noise that is not so small, or other units" if stepping is Stepping.NONE
-              else f"Try {stiff}more steps (up to five times steps={grid.steps} are tried), a larger tolerance, "
+              else f"Try {stiff}more steps (the limit is 5 x steps={grid.steps}), a larger tolerance, "
               "another rule, or a tighter prior" if stepping is Stepping.ADAPTIVE
               else f"Try {stiff}more steps (steps=...), a longest step (max_step=...), steps that follow a tolerance "
               "(tolerance=1e-3), another rule, or a tighter prior")

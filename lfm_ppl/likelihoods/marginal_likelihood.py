@@ -75,8 +75,8 @@ class MarginalLikelihood(SeriesLikelihood):
             times (8 by default). Where factors do not converge, the log density of a model that is not linear is that
             of assumed density filtering, which is rougher, and -inf in a linear one.
         method: of integration, "runge-kutta" (explicit, the default), or "exponential" for stiff dynamics: its steps of
-            order three are stable however fast a state decays, and each costs some ten of the other. With a
-            ``tolerance``, too.
+            order three are stable at any rate of decay, and each costs about ten explicit steps. It works
+            with a ``tolerance``.
 
     Raises:
         ValueError, TypeError: as `lfm_ppl.filter`; also where it is used in a ``numpyro.plate``. In compiled code a

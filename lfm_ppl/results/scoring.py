@@ -53,7 +53,7 @@ class Scores(NamedTuple):
 
 def score(result: Any, held_out: Any, level: float = 0.95, *, numpyro_model: Callable | None = None,
           inputs: Mapping[str, Any] | None = None, model_kwargs: Mapping[str, Any] | None = None) -> pd.DataFrame:
-    r"""Compare predictions with what was measured after all.
+    r"""Compare predictions with later measurements.
 
         rmse     root of the mean of (y - E y*)^2
         crps     mean of  E|y* - y| - E|y* - y*'| / 2  =  mean of  int (F(v) - 1{v >= y})^2 dv

@@ -110,7 +110,7 @@ class Switching(SeriesLikelihood):
         method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
 
     Raises:
-        ValueError, TypeError: models of other states or outputs; rates or probabilities that are none; and as
+        ValueError, TypeError: the models differ in states or outputs; a rate or a probability is invalid; and as
             `lfm_ppl.filter`. In compiled code a failure is a log density of -inf.
 
     Warns:

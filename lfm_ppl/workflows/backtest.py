@@ -109,7 +109,7 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
             of the time; "nuts" is the better choice where the posterior is wide or skew.
         draws: number of posterior draws that are propagated.
         level: of the intervals whose coverage is counted.
-        seed: of everything random.
+        seed: seed of all random numbers.
         progress: print a line for each origin.
         **options: further arguments of `lfm_ppl.fit`, such as ``warmup``, ``samples``, ``model_kwargs``, ``fixed``.
 

@@ -64,8 +64,8 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
             fit's in the argument ``events`` of the model. With several likelihood sites a dict by site.
         model_kwargs: keyword arguments of the model, as in the fit.
         draws: number of posterior draws, spread over the chains, each with a path of its own.
-        seed: of the paths and the noise.
-        progress: show on standard error how far it is.
+        seed: seed of the paths and the noise.
+        progress: show the progress on standard error.
 
     Known inputs and doses of the data CONTINUE the fit's: the rows of the fit before the first time of the new
     table stay, and the new rows follow. A table that begins with, or before, that of the fit replaces it. Until the
