@@ -18,5 +18,5 @@ def test_arviz_reads_the_result_of_a_model(name):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         result = lfm.fit(file.model, data.times, data.y, model_kwargs=file.keywords(data, {}), sampler="map",
-                         samples=100, trajectory_draws=0, progress=False)
+                         fixed=file.anchors(data), samples=100, trajectory_draws=0, progress=False)
     check_arviz(result, {"y": int(np.isfinite(data.y).sum())})
