@@ -113,4 +113,4 @@ def test_an_error_of_a_fit_keeps_its_type_and_names_the_origin(monkeypatch):
     monkeypatch.setattr("lfm_ppl.workflows.backtest.fit", fail)
     with pytest.raises(UnicodeDecodeError) as raised:
         lfm.backtest(motif.model, TIMES, data(), horizon=1, first=4)
-    assert raised.value.__notes__ == ["at the origin 2.5 (row 4)"]
+    assert raised.value.__notes__ == ["at the origin 1.7 (row 3)"]
