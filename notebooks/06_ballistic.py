@@ -37,8 +37,8 @@ import jax
 import numpy as np
 import pandas as pd
 
-from lfm_ppl.inference.bound_model import likelihood_site
 from lfm_ppl.io import loading
+from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 from lfm_ppl.studies import scores
 from lfm_ppl.studies.ballistic import figures, study
 

@@ -7,7 +7,7 @@ import inspect
 import json
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Any
 
@@ -60,7 +60,7 @@ class FitOptions:
     init: Any
     sampler_options: dict[str, Any]
     chain_method: str | None
-    settings: dict[str, Any]
+    settings: dict[str, Any] = field(default_factory=dict)
 
     @functools.cached_property
     def keys(self) -> dict[str, jax.Array]:

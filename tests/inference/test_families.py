@@ -19,7 +19,6 @@ import lfm_ppl as lfm
 from lfm_ppl.accuracy import calibration
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.io import loading
-from lfm_ppl.likelihoods.handlers import settings
 
 TIMES = 0.5 * np.arange(16)
 LENGTHSCALE = 1.5
@@ -210,7 +209,7 @@ def test_shorter_steps_leave_no_failure():
     parameters = {name: draws[name] for name in file.parameters}
     failed = {}
     for steps in (60, 640):
-        finer = settings.approximate(file.model, steps=steps)
+        finer = lfm.approximate(file.model, steps=steps)
         density = jax.jit(jax.vmap(lambda theta, m=finer: log_density(m, (data.times, data.y), {}, theta)[0]))
         failed[steps] = np.isneginf(density(parameters))
         # Only what fails is tried again
