@@ -32,7 +32,7 @@ import numpy as np
 import numpyro.distributions as dist
 
 import lfm_ppl as lfm
-from lfm_ppl.results import plots, tables
+from lfm_ppl.results import tables
 from lfm_ppl.results.arviz_data import summary
 
 quick = bool(os.environ.get("LFM_QUICK"))
@@ -98,13 +98,13 @@ print(tables.text_table(summary(result)))
 # band new measurements of it. Missing values need no special treatment.
 
 # %%
-plots.plot_fit(result, width="full")
+lfm.plot_fit(result, width="full")
 
 # %% [markdown]
 # The force that nobody measured. After the last observation its uncertainty grows back to the prior.
 
 # %%
-plots.plot_forces(result, width="full")
+lfm.plot_forces(result, width="full")
 
 # %% [markdown]
 # ## Can we believe it?
@@ -113,10 +113,10 @@ plots.plot_forces(result, width="full")
 # after predicting each observation from those before it.
 
 # %%
-plots.plot_trace(result, width="full")
+lfm.plot_trace(result, width="full")
 
 # %%
-plots.plot_residuals(result, width="full")
+lfm.plot_residuals(result, width="full")
 
 # %% [markdown]
 # ## How much does the approximation matter?

@@ -37,7 +37,7 @@ import pandas as pd
 
 import lfm_ppl as lfm
 from lfm_ppl.io import loading
-from lfm_ppl.results import plots, tables
+from lfm_ppl.results import tables
 from lfm_ppl.results.arviz_data import convergence_warnings, summary
 
 quick = bool(os.environ.get("LFM_QUICK"))
@@ -90,7 +90,7 @@ print("\n".join(convergence_warnings(result)) or "No complaint about convergence
 print(f"{result.attrs['wall_time_s']:.0f} s")
 
 # %%
-plots.plot_fit(result, width="full")
+lfm.plot_fit(result, width="full")
 
 # %% [markdown]
 # ## The activity of p53

@@ -35,7 +35,6 @@ from numpyro.infer import NUTS
 
 import lfm_ppl as lfm
 from lfm_ppl.accuracy import calibration
-from lfm_ppl.results import plots
 
 quick = bool(os.environ.get("LFM_QUICK"))
 data_sets = 8 if quick else 240
@@ -95,25 +94,25 @@ for label, model in (("linear", motif), ("softplus", softplus)):
 # ### Linear, NUTS
 
 # %%
-plots.plot_calibration(computed["linear", "NUTS"], width="full")
+lfm.plot_calibration(computed["linear", "NUTS"], width="full")
 
 # %% [markdown]
 # ### Linear, RAM
 
 # %%
-plots.plot_calibration(computed["linear", "RAM"], width="full")
+lfm.plot_calibration(computed["linear", "RAM"], width="full")
 
 # %% [markdown]
 # ### Softplus, NUTS
 
 # %%
-plots.plot_calibration(computed["softplus", "NUTS"], width="full")
+lfm.plot_calibration(computed["softplus", "NUTS"], width="full")
 
 # %% [markdown]
 # ### Softplus, RAM
 
 # %%
-plots.plot_calibration(computed["softplus", "RAM"], width="full")
+lfm.plot_calibration(computed["softplus", "RAM"], width="full")
 
 # %% [markdown]
 # ## In numbers

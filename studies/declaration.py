@@ -63,7 +63,7 @@ from matplotlib.figure import Figure
 from lfm_ppl.parallel.cluster import Workers, start_workers
 from lfm_ppl.parallel.run import run_tasks
 from lfm_ppl.parallel.task import Result, Task
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 from lfm_ppl.results.tables import write_csv, write_markdown
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.atomic_files import atomic_write

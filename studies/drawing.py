@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 
 from .scores import Estimate, Z
 

@@ -20,6 +20,8 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore", FutureWarning)
     import arviz  # noqa: F401
 
+pytest_plugins = ["synthetic_result"]
+
 jax.config.update("jax_enable_x64", True)
 
 # Most of the time of a test is compilation. JAX_COMPILATION_CACHE_DIR moves the cache.

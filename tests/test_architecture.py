@@ -29,7 +29,10 @@ LAYERS = (
     ("inference",),
     ("storage",),
     ("orbits.training", "orbits.learning", "orbits.prediction"),
-    ("results", "accuracy", "parallel"),
+    ("results", "parallel"),
+    ("accuracy",),
+    ("plots",),
+    ("report",),
     ("workflows",),
     ("",),  # the public API
     ("studies",),

@@ -14,8 +14,8 @@ import xarray as xr
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.io.data import write_csv
+from lfm_ppl.plots import plot_fit
 from lfm_ppl.results import arviz_data, rebuilding
-from lfm_ppl.results.plots import plot_fit
 from lfm_ppl.results.result_view import ResultView
 
 HOUSE = """date,indoor,heater,outside

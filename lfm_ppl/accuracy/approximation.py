@@ -22,11 +22,11 @@ import jax
 import numpy as np
 
 from lfm_ppl.accuracy import log_likelihoods
-from lfm_ppl.accuracy.log_likelihoods import LikelihoodProblem
 from lfm_ppl.filtering.integrators.integrator import Stepping
 from lfm_ppl.filtering.iterated import DEFAULT_ITERATIONS
 from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.inference.trajectories import evenly_spaced
 from lfm_ppl.likelihoods.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite
@@ -96,7 +96,7 @@ def approximation_warnings(bound: BoundModel, draws: Mapping[str, np.ndarray],
         return []
     count = len(next(iter(draws.values())))
     _, rows = evenly_spaced(1, count, min(_DRAWS, count))
-    problem = LikelihoodProblem(bound, draws).select(rows)
+    problem = ModelDraws(bound, draws).select(rows)
     fitted = log_likelihoods.gaussian(problem) if log_likelihood is None else log_likelihood[rows]
 
     def change(*selected: Refinement) -> float:

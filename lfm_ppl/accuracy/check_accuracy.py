@@ -24,10 +24,11 @@ import xarray as xr
 
 from lfm_ppl.accuracy import importance_weights, log_likelihoods
 from lfm_ppl.accuracy.approximation import finite_sd, more_iterations
-from lfm_ppl.accuracy.log_likelihoods import LikelihoodProblem, Reference, ReferenceSettings
+from lfm_ppl.accuracy.log_likelihoods import Reference, ReferenceSettings
 from lfm_ppl.accuracy.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.accuracy.verdict import NOISE_SD, NOISE_SHARE, Findings, judge
 from lfm_ppl.inference.model_digest import model_digest
+from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS, SAMPLERS
 from lfm_ppl.inference.trajectories import evenly_spaced
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -145,7 +146,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
     return report
 
 
-def _report(view: ResultView, problem: LikelihoodProblem, draw_index: np.ndarray,
+def _report(view: ResultView, problem: ModelDraws, draw_index: np.ndarray,
             settings: Mapping[str, ReferenceSettings]) -> AccuracyReport:
     shape = (view.posterior.sizes["chain"], len(draw_index))
     sites = problem.sites
@@ -181,7 +182,7 @@ def _of_all_sites(references: Mapping[str, Reference]) -> Reference:
 
 
 def _assess(view: ResultView, draw_index: np.ndarray, filtered: np.ndarray, doubled: np.ndarray, reference: Reference,
-            problem: LikelihoodProblem, iterated: np.ndarray | None) -> AccuracyReport:
+            problem: ModelDraws, iterated: np.ndarray | None) -> AccuracyReport:
     """Return the report from log likelihoods (C, S) at draws ``draw_index`` (S,) of each chain.
 
     ``filtered`` is of the Gaussian filter, ``doubled`` of twice as many steps, ``iterated`` of more iterations.
@@ -291,7 +292,7 @@ def _kind(reference: str, ssm: StateSpaceModel) -> str:
                          f"{', '.join(names)} (a force counts with its derivatives). Use reference='particles'.")
     if reference != "auto":
         return reference
-    if log_likelihoods.is_exact(ssm):
+    if ssm.has_exact_likelihood:
         return "none"
     return "grid" if one_state and _noisy(ssm) else "particles"
 
@@ -302,7 +303,7 @@ def _noisy(ssm: StateSpaceModel) -> bool:
     return callable(noise) or (noise is not None and bool(np.any(np.asarray(noise))))
 
 
-def _reference(problem: LikelihoodProblem, filtered: np.ndarray, settings: ReferenceSettings,
+def _reference(problem: ModelDraws, filtered: np.ndarray, settings: ReferenceSettings,
                count: int) -> Reference:
     """Return the reference of one site of ``count``, whose noises add up."""
     if settings.kind == "none":

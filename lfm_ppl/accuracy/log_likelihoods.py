@@ -10,8 +10,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -23,8 +23,8 @@ from lfm_ppl.filtering.ep.settings import as_settings
 from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import fokker_planck
-from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.draw_batches import BatchStore, DrawFunction, map_draws
+from lfm_ppl.inference.draw_batches import DrawFunction, map_draws
+from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import check_noise
 from lfm_ppl.model.observations.family import ObservationFamily
@@ -41,63 +41,6 @@ GRID_ERROR = 1e-2
 
 _SCOUTS = 10
 """Number of draws whose models determine the grid: extremes of each parameter, and draws between."""
-
-
-@dataclass(frozen=True)
-class LikelihoodProblem:
-    """A bound model, and draws of its parameters.
-
-    Attributes:
-        bound: the model with its times and data.
-        draws: site name -> (S, ...).
-        stores: function from the name of a computation to the store of its batches; None: no stores.
-    """
-
-    bound: BoundModel
-    draws: Mapping[str, np.ndarray]
-    stores: Callable[[str], BatchStore] | None = None
-
-    def batch_store(self, name: str) -> BatchStore | None:
-        """Return the store of the batches of a computation."""
-        return None if self.stores is None else self.stores(name)
-
-    @property
-    def example(self) -> SeriesLikelihood:
-        """The likelihood of one series at parameters from the prior; of several sites, the first that is not exact."""
-        examples = [bound.site.example for bound in self.bound.site_models.values()]
-        return next((example for example in examples if not is_exact(example.ssm)), examples[0])
-
-    @property
-    def y(self) -> np.ndarray:
-        """The data, (T, D), or (B, T, D) for a panel."""
-        return np.asarray(self.bound.y)
-
-    @property
-    def sites(self) -> dict[str, LikelihoodProblem]:
-        """The same draws with one likelihood site selected, by name of the site."""
-        if not self.bound.is_by_site:
-            return {self.bound.site.name: self}
-        return {name: replace(self, bound=bound).rename_stores(suffix=f" of site {name}")
-                for name, bound in self.bound.site_models.items()}
-
-    @property
-    def size(self) -> int:
-        """S, the number of draws."""
-        return len(next(iter(self.draws.values())))
-
-    @property
-    def series(self) -> int:
-        """Number of series."""
-        return len(self.bound.site.members)
-
-    def select(self, rows: Any) -> LikelihoodProblem:
-        """Return the same problem with some of the draws."""
-        return replace(self, draws={name: value[rows] for name, value in self.draws.items()})
-
-    def rename_stores(self, prefix: str = "", suffix: str = "") -> LikelihoodProblem:
-        """Return the same problem, whose computations are stored under other names."""
-        stores = self.stores
-        return self if stores is None else replace(self, stores=lambda name: stores(f"{prefix}{name}{suffix}"))
 
 
 @dataclass(frozen=True)
@@ -139,16 +82,7 @@ class ReferenceSettings:
     show_progress: bool = False
 
 
-def is_exact(ssm: StateSpaceModel) -> bool:
-    """Whether the Gaussian filter computes the exact likelihood, up to the integration of known inputs.
-
-    Dynamics and observation are linear then, with constant coefficients and Gaussian noise.
-    """
-    is_family = isinstance(ssm.model.observation, ObservationFamily)
-    return ssm.plan.has_exact_transition and ssm.plan.has_exact_update and not is_family
-
-
-def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods", **settings: Any) -> np.ndarray:
+def gaussian(problem: ModelDraws, name: str = "log likelihoods", **settings: Any) -> np.ndarray:
     """Return log likelihoods (S,) of the Gaussian filter, with other settings, summed over the series of a panel."""
     bound = problem.bound.approximate(**settings) if settings else problem.bound
 
@@ -159,7 +93,7 @@ def gaussian(problem: LikelihoodProblem, name: str = "log likelihoods", **settin
                      rows=bound.times.size, store=problem.batch_store(name))["total"]
 
 
-def recorded(problem: LikelihoodProblem, log_likelihoods: np.ndarray) -> np.ndarray:
+def recorded(problem: ModelDraws, log_likelihoods: np.ndarray) -> np.ndarray:
     """Return (S,): the log likelihoods that a result stores, sums of one-step-ahead terms.
 
     For Gaussian observations the sum is the log likelihood; for an observation family assumed density filtering.
@@ -190,7 +124,7 @@ def finer_steps(example: SeriesLikelihood) -> dict[str, Any]:
     return settings
 
 
-def on_grid(problem: LikelihoodProblem, settings: ReferenceSettings) -> Reference:
+def on_grid(problem: ModelDraws, settings: ReferenceSettings) -> Reference:
     """Return the log likelihoods by the Fokker-Planck equation on one grid for all draws.
 
     Raises:
@@ -217,7 +151,7 @@ def takes_smoother_draws(ssm: StateSpaceModel) -> bool:
     return isinstance(ssm.model.observation, ObservationFamily) and ssm.plan.is_linear
 
 
-def by_particles(problem: LikelihoodProblem, settings: ReferenceSettings, noise: Callable[[np.ndarray], float],
+def by_particles(problem: ModelDraws, settings: ReferenceSettings, noise: Callable[[np.ndarray], float],
                  target: float, most_work: float, is_settled: Callable[[np.ndarray], bool] | None = None) -> Reference:
     """Return replicates of the particle filter's estimates, or of importance sampling where `takes_smoother_draws`.
 
@@ -281,7 +215,7 @@ _SAFETY = 1.2
 """Factor on the number of particles of the pilot run, which is an estimate."""
 
 
-def _particle_estimates(problem: LikelihoodProblem, particles: int, settings: ReferenceSettings,
+def _particle_estimates(problem: ModelDraws, particles: int, settings: ReferenceSettings,
                         key: jax.Array) -> np.ndarray:
     """Return estimates (S, B, R) of the likelihoods of each series."""
     example, steps = problem.example, settings.steps
@@ -314,14 +248,14 @@ def _particle_estimates(problem: LikelihoodProblem, particles: int, settings: Re
     return _map_sequentially(problem, key, name, per_draw, settings.show_progress)
 
 
-def _map_sequentially(problem: LikelihoodProblem, key: jax.Array, name: tuple[str, *tuple[Hashable, ...]],
+def _map_sequentially(problem: ModelDraws, key: jax.Array, name: tuple[str, *tuple[Hashable, ...]],
                       per_draw: Callable, show_progress: bool) -> np.ndarray:
     """Map over draws, one after another, with a display of the progress."""
     return map_draws(problem.bound, DrawFunction(name, per_draw, (problem.bound.constants,)), problem.draws, key,
                      report=Console() if show_progress else None, store=problem.batch_store(name[0]))
 
 
-def _scout_models(problem: LikelihoodProblem) -> list[Any]:
+def _scout_models(problem: ModelDraws) -> list[Any]:
     """Return latent force models at draws that span the posterior, to lay out one grid for all."""
     flat = np.column_stack([np.reshape(value, (problem.size, -1)) for value in problem.draws.values()])
     extreme = np.concatenate([flat.argmin(axis=0), flat.argmax(axis=0)])

@@ -27,7 +27,8 @@ from lfm_ppl.cli.fit_arguments import TIME_UNIT
 from lfm_ppl.cli.options import CheckOptions
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.inference.trajectories import evenly_spaced
-from lfm_ppl.results import arviz_data, html_report, rebuilding, tables
+from lfm_ppl.report import html_report
+from lfm_ppl.results import arviz_data, rebuilding, tables
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.series import times_of
 from lfm_ppl.storage import checkpoint, files
@@ -122,7 +123,7 @@ def _check_likelihood(task: StoredFit) -> None:
 
 def _write(report: AccuracyReport, posterior: Any, path: Path, command: str) -> int:
     """Store the report in the result and beside it; return 1 if the figure or the page fails."""
-    from lfm_ppl.results.plots import plot_accuracy
+    from lfm_ppl.plots import plot_accuracy
 
     # Load the file again: another process may have added to it.
     stored = arviz_data.add_group(arviz_data.load(path), GROUP, report.to_dataset().assign_attrs(command_line=command))

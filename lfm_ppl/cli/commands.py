@@ -224,8 +224,9 @@ def _default(value: Any) -> str:
                                      "plot posterior.nc --out figures --format pdf"))
 def plot(result: Result, /, *, options: PlotOptions = PlotOptions()) -> None:
     """Draw the figures of a saved result again."""
+    from lfm_ppl import plots
     from lfm_ppl.cli.folders import check_writable
-    from lfm_ppl.results import arviz_data, plots
+    from lfm_ppl.results import arviz_data
     from lfm_ppl.storage import files
 
     path = files.locate(result)

@@ -11,7 +11,8 @@ from typing import Any
 
 from lfm_ppl.cli import folders, pages
 from lfm_ppl.cli.options import StudyOptions
-from lfm_ppl.results import html_report, tables
+from lfm_ppl.report import html_report
+from lfm_ppl.results import tables
 from lfm_ppl.studies.catalogue import CatalogueEntry
 from lfm_ppl.studies.declaration import StudyResult
 from lfm_ppl.utils.progress import Console, duration

@@ -28,7 +28,8 @@ from lfm_ppl.inference.bind import bind
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import OF_SERIES, Data, InputTable, stack_series
 from lfm_ppl.io.truth import read_truth
-from lfm_ppl.results import arviz_data, html_report, tables
+from lfm_ppl.report import html_report
+from lfm_ppl.results import arviz_data, tables
 from lfm_ppl.results.fields import add_fields
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.storage import checkpoint, files
@@ -188,7 +189,7 @@ def _print_settings(options: FitArguments, model_options: dict[str, Any], observ
 
 def report(posterior: Any, folder: Path, seconds: float, overwrite: bool) -> int:
     """Write and print the results, without figures if they are partial; return 1 if figures or report failed."""
-    from lfm_ppl.results.plots import save_figures
+    from lfm_ppl.plots import save_figures
     from lfm_ppl.results.residuals import misfit
 
     # A checkpoint has written a partial or complete result under this name.

@@ -25,7 +25,8 @@ from lfm_ppl.cli.options import DataOptions, FitArguments
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.io import loading
 from lfm_ppl.io.data_set import Data
-from lfm_ppl.results import arviz_data, html_report, tables
+from lfm_ppl.report import html_report
+from lfm_ppl.results import arviz_data, tables
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.storage import files
 from lfm_ppl.utils.progress import duration

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 import lfm_ppl
+from lfm_ppl import plots
 from lfm_ppl.cli import choices, folders, pages, session
 from lfm_ppl.cli.data_file import output_columns
 from lfm_ppl.cli.fit_arguments import TIME_UNIT
@@ -28,7 +29,8 @@ from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
 from lfm_ppl.io.data_set import Data, continued_inputs, on_clock_of_fit
 from lfm_ppl.io.dosing import ROLES
-from lfm_ppl.results import arviz_data, html_report, inputs, plots, tables
+from lfm_ppl.report import html_report
+from lfm_ppl.results import arviz_data, inputs, tables
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, MEAN, held_out_data, summary
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.series import series_view

@@ -69,7 +69,6 @@ def _bind(model: loading.ModelFile) -> Any:
 
 
 def _print_sites(model: loading.ModelFile, bound: Any) -> None:
-    from lfm_ppl.accuracy.log_likelihoods import is_exact
     from lfm_ppl.likelihoods.priors import prior, support
 
     trace, example = bound.trace(), bound.site.example
@@ -96,7 +95,7 @@ def _print_sites(model: loading.ModelFile, bound: Any) -> None:
              settings.iterations and f"{settings.iterations} iterations"]
     factors = f"; factors by {example.factors_in_words}" if example.factors_in_words else ""
     text = ", ".join(filter(None, parts)) + factors
-    if is_exact(example.ssm) or not example.has_gaussian_state:
+    if example.ssm.has_exact_likelihood or not example.has_gaussian_state:
         is_exact_likelihood = example.has_gaussian_state and example.ssm.plan.has_exact_moments
         text = "exact: the model is linear" if is_exact_likelihood else example.description
     print(f"likelihood: {text}\n")

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from lfm_ppl.results import html_report
+from lfm_ppl.report import html_report
 from lfm_ppl.utils.atomic_files import atomic_write
 
 
@@ -23,7 +23,7 @@ def update(result: Any, folder: Path, figures: Sequence[Path] = (),
            more: Mapping[str, pd.DataFrame] | None = None) -> int:
     """Write the report of an extended result beside it, with further figures and tables; return 1 if that fails."""
     def write() -> Path:
-        from lfm_ppl.results.plots.saving import pages_of
+        from lfm_ppl.plots.saving import pages_of
 
         # By name: the folder may hold figures of a replaced result.
         stored = [path for name, _, _ in pages_of(result, "full") if (path := folder / f"{name}.png").is_file()]

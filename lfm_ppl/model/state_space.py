@@ -27,6 +27,7 @@ from lfm_ppl.linearisation.input_selection import InputStructure
 from lfm_ppl.model.events import StateMap, state_maps
 from lfm_ppl.model.integration_plan import IntegrationPlan, integration_plan
 from lfm_ppl.model.latent_force_model import LatentForceModel
+from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.structure import Pattern, pattern
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.linalg import matmul
@@ -80,6 +81,15 @@ class StateSpaceModel(eqx.Module):
     def output_dim(self) -> int:
         """D, the number of outputs."""
         return len(self.model.output_names)
+
+    @property
+    def has_exact_likelihood(self) -> bool:
+        """Whether the Gaussian filter computes the exact likelihood, up to the integration of known inputs.
+
+        Dynamics and observation are linear then, with constant coefficients and Gaussian noise.
+        """
+        is_family = isinstance(self.model.observation, ObservationFamily)
+        return self.plan.has_exact_transition and self.plan.has_exact_update and not is_family
 
     def initial(self) -> tuple[jax.Array, jax.Array]:
         """Return mean (n,) and covariance (n, n) of s at the initial time."""

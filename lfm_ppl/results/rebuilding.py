@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.accuracy.log_likelihoods import LikelihoodProblem
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.io.data_set import (
     OF_SERIES,
     InputTable,
@@ -181,7 +181,7 @@ def _check_doses(name: str, stored: InputTable, table: InputTable, first: float,
 
 
 def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = None,
-            model_kwargs: Mapping[str, Any] | None = None) -> LikelihoodProblem:
+            model_kwargs: Mapping[str, Any] | None = None) -> ModelDraws:
     """Return model, data and all draws (C * N, ...) of the sample sites, with the result's fixed parameters.
 
     Raises:
@@ -212,7 +212,7 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
     bound = bound.fix(view.decoded("fixed"))
     if not bound.sites:
         raise ValueError("the model has no parameters that are sampled, so there is nothing to check.")
-    return LikelihoodProblem(bound, parameter_draws(bound, posterior))
+    return ModelDraws(bound, parameter_draws(bound, posterior))
 
 
 def further_parameters(numpyro_model: Callable) -> dict[str, inspect.Parameter]:

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.accuracy.log_likelihoods import LikelihoodProblem
+from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.inference.trajectories import evenly_spaced, has_noise_of_rows, trajectories
 from lfm_ppl.io.data_set import OF_SERIES, Data, on_clock_of_fit
 from lfm_ppl.model.events import Event
@@ -277,7 +277,7 @@ def _checked(times: Any) -> np.ndarray:
     return checks.time_vector("times", times, order="non-decreasing")
 
 
-def _forecast(key: jax.Array, view: ResultView, problem: LikelihoodProblem, times: np.ndarray,
+def _forecast(key: jax.Array, view: ResultView, problem: ModelDraws, times: np.ndarray,
               draws: int, progress: bool, has_rows: bool) -> dict[str, xr.Dataset]:
     """Return the groups of a forecast of one site; ``has_rows`` if the last rows of the data have these times."""
     bound = problem.bound

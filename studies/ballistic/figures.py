@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 
 from ..datasets import select_prefix
 from ..declaration import Data

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 
 from ..declaration import Data
 from ..drawing import SHADE, TRUTH, legend

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from scipy import stats
 
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 
 from ..datasets import select_prefix
 from ..declaration import Data

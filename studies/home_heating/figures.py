@@ -14,7 +14,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 
 from ..datasets import select_prefix
 from ..declaration import Data

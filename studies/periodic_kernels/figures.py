@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lfm_ppl import forces
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 
 from ..declaration import Data
 from ..drawing import TRUTH, band, legend

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 
 from ..declaration import Data
 from ..drawing import band, line, patch

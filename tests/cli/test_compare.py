@@ -75,7 +75,7 @@ def test_a_page_that_fails_does_not_cost_the_tables(run, requests, monkeypatch):
     def fail(*arguments, **keywords):
         raise OSError("no space left")
 
-    monkeypatch.setattr("lfm_ppl.results.html_report.write_page", fail)
+    monkeypatch.setattr("lfm_ppl.report.html_report.write_page", fail)
     status, out, err = run("compare gps --out here --quiet")
     assert status == 1 and "EKF  0.500" in out and "no space left" in err
 

@@ -17,8 +17,8 @@ from lfm_ppl.accuracy.check_accuracy import check_accuracy
 from lfm_ppl.accuracy.correction import correct_posterior
 from lfm_ppl.accuracy.report import AccuracyReport
 from lfm_ppl.accuracy.verdict import Findings, judge
+from lfm_ppl.plots import plot_accuracy
 from lfm_ppl.results import arviz_data, rebuilding
-from lfm_ppl.results.plots import plot_accuracy
 from lfm_ppl.results.result_view import ResultView
 
 TIMES = np.arange(6.0)

@@ -10,7 +10,7 @@ from scipy import stats
 
 import lfm_ppl as lfm
 from lfm_ppl.accuracy import calibration
-from lfm_ppl.results.plots import plot_calibration
+from lfm_ppl.plots import plot_calibration
 
 DRAWS = 63
 

@@ -15,9 +15,9 @@ from scipy import special, stats
 import lfm_ppl as lfm
 from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.inference.factor_failures import factor_failures
+from lfm_ppl.plots.saving import pages_of
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.family_scores import log_densities
-from lfm_ppl.results.plots.saving import pages_of
 from lfm_ppl.results.predictions import summary
 from lfm_ppl.results.result_view import ResultView
 

@@ -5,9 +5,9 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
+from lfm_ppl.plots import save_figures
 from lfm_ppl.results.arviz_data import add_group, build
 from lfm_ppl.results.fields import add_fields
-from lfm_ppl.results.plots import save_figures
 from lfm_ppl.results.result_view import ResultView
 
 BASIS = lfm.LaplaceBasis((0.0, 2.0), 3)

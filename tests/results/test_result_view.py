@@ -7,8 +7,8 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
+from lfm_ppl.plots import plot_trace, saving
 from lfm_ppl.results import arviz_data, tables
-from lfm_ppl.results.plots import plot_trace, saving
 from lfm_ppl.results.result_view import LIKELIHOODS, ResultView
 
 

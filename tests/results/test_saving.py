@@ -7,8 +7,8 @@ import matplotlib.image
 import pytest
 import xarray as xr
 
+from lfm_ppl.plots import save_figures
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.plots import save_figures
 from lfm_ppl.results.result_view import ResultView
 
 ALL = ["fit", "forces", "states", "trace", "pairs", "residuals"]
@@ -57,7 +57,7 @@ def test_unknown_format(tmp_path, result):
 
 @pytest.mark.slow
 def test_long_lists_go_to_numbered_pages(tmp_path, crowded, monkeypatch):
-    saving = import_module("lfm_ppl.results.plots.saving")
+    saving = import_module("lfm_ppl.plots.saving")
     trajectories = ResultView.of(crowded).group("trajectories")
     data = ResultView.of(crowded).group("data")
     small = arviz_data.build({"trajectories": trajectories, "data": data})

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from lfm_ppl.parallel.task import Task
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 from lfm_ppl.studies import declaration, drawing, published
 from lfm_ppl.studies.datasets import TaskKind, row
 from lfm_ppl.studies.declaration import Study, StudyTable, setting

@@ -13,7 +13,7 @@ import pytest
 import lfm_ppl as lfm
 from lfm_ppl.io.data import read_csv
 from lfm_ppl.io.data_set import Data, stack_series
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 from lfm_ppl.utils import calendar_time
 from lfm_ppl.workflows.data_binding import bind_data
 

@@ -378,7 +378,7 @@ def test_ctrl_c_leaves_a_usable_result_within_ten_seconds(tmp_path):
 def test_a_finished_run_is_left_alone_by_the_command(tmp_path, monkeypatch):
     (tmp_path / "relaxation.py").write_text(MODEL)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lfm_ppl.results.plots.save_figures", lambda *arguments, **keywords: [])
+    monkeypatch.setattr("lfm_ppl.plots.save_figures", lambda *arguments, **keywords: [])
     line = ["fit", "relaxation.py", "--sampler", "map", "--samples", "8", "--quiet", "--out", "run"]
     assert main(line) == 0
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()}

@@ -9,8 +9,8 @@ import xarray as xr
 from matplotlib import pyplot
 
 import lfm_ppl as lfm
+from lfm_ppl.plots import plot_fit, plot_forces, plot_residuals, plot_states
 from lfm_ppl.results import arviz_data, rebuilding
-from lfm_ppl.results.plots import plot_fit, plot_forces, plot_residuals, plot_states
 from lfm_ppl.results.result_view import ResultView
 
 TIMES = np.array([[0.0, 1.0, 2.5, 4.0], [0.0, 0.5, 3.0, 3.0]])

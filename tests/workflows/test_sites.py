@@ -11,8 +11,8 @@ import xarray as xr
 
 import lfm_ppl as lfm
 from lfm_ppl.inference.trajectories import trajectories
+from lfm_ppl.plots import save_figures
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.plots import save_figures
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.workflows.data_binding import data_by_site
 

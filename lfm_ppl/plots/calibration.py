@@ -11,7 +11,7 @@ from matplotlib.ticker import FixedLocator
 from scipy import stats
 
 from lfm_ppl.accuracy.calibration import Calibration, p_values
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 
 MAX_PANELS = 9
 _BAND = "#DDDDDD"

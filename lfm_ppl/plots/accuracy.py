@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lfm_ppl.accuracy.report import AccuracyReport
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.scalars import choose
 

@@ -13,9 +13,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
+from lfm_ppl.plots import style
 from lfm_ppl.results.inputs import FORECAST
 from lfm_ppl.results.inputs import GROUP as CONSTANT
-from lfm_ppl.results.plots import style
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, INTERVAL, MEAN, interval, noise_free_interval
 from lfm_ppl.results.result_view import ENTRY, ResultView
 from lfm_ppl.results.series import times_of

@@ -26,9 +26,9 @@ from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup
 
 from lfm_ppl.accuracy import report
+from lfm_ppl.plots import saving
 from lfm_ppl.results import arviz_data, predictions, tables
 from lfm_ppl.results.inputs import ORIGIN
-from lfm_ppl.results.plots import saving
 from lfm_ppl.results.residuals import misfit
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.scalars import unit_of
@@ -76,7 +76,7 @@ def save_report(result: Any, path: str | Path, overwrite: bool = False, *, figur
         result: of `lfm_ppl.fit`, `lfm_ppl.to_arviz` or `lfm_ppl.forecast`, or read by `lfm_ppl.load`.
         path: the file to write, or a folder, in which it is ``report.html``.
         overwrite: replace a file that exists.
-        figures: PNG files to show, as `lfm_ppl.results.plots.save_figures` wrote them; None: all that the result has
+        figures: PNG files to show, as `lfm_ppl.plots.save_figures` wrote them; None: all that the result has
             the numbers for are drawn. A figure that cannot be drawn is named on the page.
         more: title -> table, shown after the forecast: scores, for instance.
 
@@ -157,7 +157,7 @@ def _template() -> Template:
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
     environment.filters |= {"format_cells": tables.format_cells, "column_kinds": _column_kinds,
                             "base64": lambda png: base64.b64encode(png).decode("ascii")}
-    return environment.from_string(resources.files("lfm_ppl.results").joinpath("report.html.jinja").read_text("utf-8"))
+    return environment.from_string(resources.files("lfm_ppl.report").joinpath("report.html.jinja").read_text("utf-8"))
 
 
 def _column_kinds(frame: pd.DataFrame) -> list[tuple[str, str]]:

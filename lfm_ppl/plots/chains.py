@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy import stats
 
-from lfm_ppl.results.plots import style
+from lfm_ppl.plots import style
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.scalars import choose, sampled
 

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lfm_ppl.io.data_set import InputTable
-from lfm_ppl.results.plots import forecasts, style
-from lfm_ppl.results.plots.trajectories import MAX_PANELS, finish
+from lfm_ppl.plots import forecasts, style
+from lfm_ppl.plots.trajectories import MAX_PANELS, finish
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.utils.checks import one_of
 

@@ -12,9 +12,7 @@ from matplotlib.colors import to_hex
 from scipy import stats
 
 from lfm_ppl.io.data_set import InputTable
-from lfm_ppl.results import arviz_data
-from lfm_ppl.results.inputs import to_dataset
-from lfm_ppl.results.plots import (
+from lfm_ppl.plots import (
     forecasts,
     plot_deterministics,
     plot_fit,
@@ -26,6 +24,8 @@ from lfm_ppl.results.plots import (
     plot_trace,
     style,
 )
+from lfm_ppl.results import arviz_data
+from lfm_ppl.results.inputs import to_dataset
 from lfm_ppl.results.predictions import PERIODS
 from lfm_ppl.results.result_view import ResultView
 

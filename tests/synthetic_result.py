@@ -1,4 +1,4 @@
-"""A synthetic result: three genes under two forces, 4 chains of 100 draws, 30 measurement times."""
+"""A synthetic result as fixtures: three genes under two forces, 4 chains of 100 draws, 30 measurement times."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfm_ppl.results.plots import forecasts, style
+from lfm_ppl.plots import forecasts, style
 from lfm_ppl.results.predictions import INTERVAL, PERIODS, REGIMES, SHOWN_PERIODS, quantiles, repeats_often
 from lfm_ppl.results.result_view import ENTRY, ResultView
 from lfm_ppl.results.scalars import unit_of

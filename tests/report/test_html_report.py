@@ -13,7 +13,8 @@ import xarray as xr
 import lfm_ppl as lfm
 from lfm_ppl.accuracy.importance_weights import COLUMNS
 from lfm_ppl.cli import pages as cli_page
-from lfm_ppl.results import arviz_data, html_report
+from lfm_ppl.report import html_report
+from lfm_ppl.results import arviz_data
 
 VOID = {"meta", "img", "wbr"}
 EVIL = "<script>alert('&\"')</script>"
@@ -179,7 +180,7 @@ def test_figures_are_drawn_and_a_failed_figure_is_named(groups, tmp_path, monkey
     def fail(*arguments, **keywords):
         raise RuntimeError("no <ink>")
 
-    monkeypatch.setattr("lfm_ppl.results.plots.pairs.plot_pairs", fail)
+    monkeypatch.setattr("lfm_ppl.plots.pairs.plot_pairs", fail)
     page = read(lfm.save_report(arviz_data.build({"posterior": groups["posterior"]}), tmp_path))
     (picture,) = (target for target in page.targets if target.startswith("data:"))
     assert base64.b64decode(picture.partition(",")[2]).startswith(b"\x89PNG")

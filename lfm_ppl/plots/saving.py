@@ -11,8 +11,8 @@ from typing import Any
 from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 
+from lfm_ppl.plots import accuracy, chains, fields, forecasts, inputs, pairs, residuals, trajectories
 from lfm_ppl.results.fields import GROUP as FIELD
-from lfm_ppl.results.plots import accuracy, chains, fields, forecasts, inputs, pairs, residuals, trajectories
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.scalars import sampled
 from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing

@@ -9,8 +9,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lfm_ppl.plots import style
 from lfm_ppl.results.fields import GROUP, evaluate_field
-from lfm_ppl.results.plots import style
 from lfm_ppl.results.result_view import ResultView
 
 _SNAPSHOTS = (0.1, 0.5, 0.9)

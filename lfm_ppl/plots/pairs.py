@@ -14,8 +14,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfm_ppl.results.plots import style
-from lfm_ppl.results.plots.chains import parameters_to_draw
+from lfm_ppl.plots import style
+from lfm_ppl.plots.chains import parameters_to_draw
 from lfm_ppl.results.result_view import ResultView
 
 _SMALLEST, _MARGIN = 0.77, 0.8  # inches: a panel that holds its labels, the room beside them
