@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from lfm_ppl.cli.options import RULES, Columns
-from lfm_ppl.io.data_set import DOSE, ONCE, dosed_states
 from lfm_ppl.io.dosing import ROLES
+from lfm_ppl.io.input_table import DOSE, ONCE, dosed_states
 from lfm_ppl.io.loading import ModelFile
 from lfm_ppl.utils import checks
 

@@ -26,7 +26,8 @@ from lfm_ppl.cli.options import DataOptions, FitArguments
 from lfm_ppl.cli.requested_times import trajectory_times
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.io import loading
-from lfm_ppl.io.data_set import OF_SERIES, Data, InputTable, stack_series
+from lfm_ppl.io.data_set import Data, stack_series
+from lfm_ppl.io.input_table import OF_SERIES, InputTable
 from lfm_ppl.io.truth import read_truth
 from lfm_ppl.report import html_report
 from lfm_ppl.results import arviz_data, tables

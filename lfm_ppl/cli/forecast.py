@@ -27,8 +27,9 @@ from lfm_ppl.cli.options import ForecastOptions, Times
 from lfm_ppl.cli.requested_times import requested_times
 from lfm_ppl.cli.stored_fit import StoredFit, rebuild_fit
 from lfm_ppl.io import data
-from lfm_ppl.io.data_set import Data, continued_inputs, on_clock_of_fit
+from lfm_ppl.io.data_set import Data, on_clock_of_fit
 from lfm_ppl.io.dosing import ROLES
+from lfm_ppl.io.input_table import continued_inputs
 from lfm_ppl.report import html_report
 from lfm_ppl.results import arviz_data, inputs, tables
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, MEAN, held_out_data, summary

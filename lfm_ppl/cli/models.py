@@ -9,7 +9,8 @@ import numpy as np
 
 from lfm_ppl.cli import session
 from lfm_ppl.io import loading
-from lfm_ppl.io.data_set import ONCE, Data, InputTable
+from lfm_ppl.io.data_set import Data
+from lfm_ppl.io.input_table import ONCE, InputTable
 
 _TYPES = {float: "a number", int: "a whole number", bool: "true or false"}
 

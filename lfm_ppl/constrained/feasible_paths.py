@@ -32,8 +32,9 @@ from lfm_ppl.filtering.forward import FilterTrace
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
 from lfm_ppl.filtering.update import Factors
-from lfm_ppl.utils.linalg import congruence, diagonal, matmul, semidefinite_root
+from lfm_ppl.utils.linalg import congruence, diagonal, matmul
 from lfm_ppl.utils.random_keys import split_by_name
+from lfm_ppl.utils.semidefinite import semidefinite_root
 
 _ROUNDING_VARIANCE = 1e-13
 """Variances below this multiple of the predicted variance (of a state: of its variance before the draws of its row) are

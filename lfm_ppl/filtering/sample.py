@@ -29,15 +29,9 @@ from lfm_ppl.filtering.forward import FilterTrace
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
 from lfm_ppl.utils.gaussian_residuals import masked
-from lfm_ppl.utils.linalg import (
-    cholesky,
-    congruence,
-    matmul,
-    pivoted_root,
-    solve_lower,
-    solve_upper,
-)
+from lfm_ppl.utils.linalg import cholesky, congruence, matmul, solve_lower, solve_upper
 from lfm_ppl.utils.random_keys import split_by_name
+from lfm_ppl.utils.semidefinite import pivoted_root
 
 
 def sample_errors(key: jax.Array, trace: FilterTrace, draws: int) -> jax.Array:

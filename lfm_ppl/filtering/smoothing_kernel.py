@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from lfm_ppl.filtering.moments import Moments, matvec
-from lfm_ppl.utils.linalg import congruence, factorise_semidefinite, matmul
+from lfm_ppl.utils.linalg import congruence, matmul
+from lfm_ppl.utils.semidefinite import factorise_semidefinite
 
 
 class SmoothingKernel(NamedTuple):

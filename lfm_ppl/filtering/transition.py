@@ -25,17 +25,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.forces.discretise import (
-    discretise,
-    discretise_dispersion,
-    discretise_steps,
-    phi_functions,
-    scalar_phi_functions,
-)
+from lfm_ppl.forces.discretise import discretise, discretise_dispersion, discretise_steps
+from lfm_ppl.forces.phi_functions import phi_functions, scalar_phi_functions
 from lfm_ppl.linearisation.input_selection import InputStructure
 from lfm_ppl.linearisation.rule import Function, partial_jacobian, selection
 from lfm_ppl.model.state_space import StateSpaceModel
-from lfm_ppl.utils.linalg import congruence, diagonal, matmul, safe_sqrt, solve_semidefinite
+from lfm_ppl.utils.linalg import congruence, diagonal, matmul, safe_sqrt
+from lfm_ppl.utils.semidefinite import solve_semidefinite
 
 
 class LinearPart(NamedTuple):

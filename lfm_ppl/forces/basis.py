@@ -26,7 +26,8 @@ from scipy.special import roots_legendre
 from lfm_ppl.forces.eigenspace import leading_eigenvectors
 from lfm_ppl.forces.periodic_kernels import PeriodicCovariance
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import matmul, semidefinite_root, solve_lower
+from lfm_ppl.utils.linalg import matmul, solve_lower
+from lfm_ppl.utils.semidefinite import semidefinite_root
 
 _NEGATIVE = 1e-8
 """Negative eigenvalues up to this share of the sum of all eigenvalues are attributed to rounding."""

@@ -25,7 +25,7 @@ import scipy.linalg
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.discretise import discretise_dispersion
-from lfm_ppl.utils.linalg import semidefinite_root
+from lfm_ppl.utils.semidefinite import semidefinite_root
 
 
 class ApproximationWarning(UserWarning):

@@ -33,9 +33,9 @@ from lfm_ppl.model.stiff_simulation import warn_of_infinite_states
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.particles.particle_smoother import TRACING, draw_trajectories
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import semidefinite_root
 from lfm_ppl.utils.progress import Reporter
 from lfm_ppl.utils.random_keys import split_by_name
+from lfm_ppl.utils.semidefinite import semidefinite_root
 
 _FILTERS = 4
 """Number of particle filters from which the path of one draw is chosen."""

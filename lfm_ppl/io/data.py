@@ -11,8 +11,9 @@ import numpy as np
 
 from lfm_ppl.io import dosing, time_columns
 from lfm_ppl.io import table as tables
-from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, Data, InputTable, fill_blanks
+from lfm_ppl.io.data_set import Data
 from lfm_ppl.io.data_set import stack_series as stack_series
+from lfm_ppl.io.input_table import DOSE, INTERPOLATIONS, InputTable, fill_blanks
 from lfm_ppl.io.missing_codes import warn_of_codes
 from lfm_ppl.io.series_columns import IDENTIFIERS, check_order
 from lfm_ppl.io.table import Table, words_of

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from lfm_ppl.io.data_set import DOSE, ONCE, InputTable, end_at_resets
+from lfm_ppl.io.input_table import DOSE, ONCE, InputTable, end_at_resets
 from lfm_ppl.io.missing_codes import warn_of_codes
 from lfm_ppl.io.table import Table, as_number, is_missing
 from lfm_ppl.utils import checks

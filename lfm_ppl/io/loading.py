@@ -39,7 +39,8 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
 
-from lfm_ppl.io.data_set import DOSE, INTERPOLATIONS, OF_SERIES, Data
+from lfm_ppl.io.data_set import Data
+from lfm_ppl.io.input_table import DOSE, INTERPOLATIONS, OF_SERIES
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.shipped_files import shipped_folder
 

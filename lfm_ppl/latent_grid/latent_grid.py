@@ -39,7 +39,7 @@ from lfm_ppl.model.observation_noise import check_noise, log_density, noisy_obse
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel, check_times, state_space
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import semidefinite_root
+from lfm_ppl.utils.semidefinite import semidefinite_root
 
 QUADRATURES = ("riemann", "trapezoid", "linear")
 

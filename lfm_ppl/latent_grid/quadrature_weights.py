@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.forces.discretise import phi_functions
+from lfm_ppl.forces.phi_functions import phi_functions
 
 
 class CutCells(eqx.Module):

@@ -12,7 +12,8 @@ from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.utils import checks, gaussian_residuals
 from lfm_ppl.utils.gaussian_residuals import masked, wrapped
-from lfm_ppl.utils.linalg import cholesky, matmul, semidefinite_root, solve_lower
+from lfm_ppl.utils.linalg import cholesky, matmul, solve_lower
+from lfm_ppl.utils.semidefinite import semidefinite_root
 
 
 def log_density(ssm: StateSpaceModel, w: jax.Array, t: jax.Array, row: jax.Array,

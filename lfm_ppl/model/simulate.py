@@ -35,9 +35,10 @@ from lfm_ppl.model.observation_noise import noisy_observation
 from lfm_ppl.model.state_space import Span, StateSpaceModel, check_times, state_space
 from lfm_ppl.model.stiff_simulation import divide_steps, exponential_change, warn_of_infinite_states
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import fastest_rate, matmul, semidefinite_root
+from lfm_ppl.utils.linalg import fastest_rate, matmul
 from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.random_keys import split_by_name
+from lfm_ppl.utils.semidefinite import semidefinite_root
 
 LONGEST_PRODUCT = 1.0
 """Largest product of step and fastest rate of an explicit step.

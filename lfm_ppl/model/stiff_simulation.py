@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.forces.discretise import discretise_driven
+from lfm_ppl.forces.phi_functions import discretise_driven
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import matmul, outer_square, semidefinite_root
+from lfm_ppl.utils.linalg import matmul, outer_square
+from lfm_ppl.utils.semidefinite import semidefinite_root
 
 _MOST_NODES = 20_000
 """Largest number of breakpoints that bound the steps."""

@@ -33,7 +33,8 @@ from lfm_ppl.model.state_space import Span, StateSpaceModel
 from lfm_ppl.model.structure import pattern
 from lfm_ppl.particles.normals import normals
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import matmul, semidefinite_root
+from lfm_ppl.utils.linalg import matmul
+from lfm_ppl.utils.semidefinite import semidefinite_root
 
 SCHEMES = ("exact", "srk", "milstein", "euler")
 

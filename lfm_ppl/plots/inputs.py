@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lfm_ppl.io.data_set import InputTable
+from lfm_ppl.io.input_table import InputTable
 from lfm_ppl.plots import forecasts, style
 from lfm_ppl.plots.trajectories import MAX_PANELS, finish
 from lfm_ppl.results.result_view import ResultView
@@ -37,7 +37,7 @@ def plot_inputs(result: Any, inputs: Sequence[str] | None = None, *, width: str 
 
     Example:
         >>> import numpy as np
-        >>> from lfm_ppl.io.data_set import InputTable
+        >>> from lfm_ppl.io.input_table import InputTable
         >>> from lfm_ppl.results.arviz_data import build
         >>> from lfm_ppl.results.inputs import GROUP, to_dataset
         >>> heater = InputTable(np.array([0.0, 6.0, 22.0]), np.array([0.0, 1.0, 0.0]), "previous")

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.io.data_set import Data, InputTable
+from lfm_ppl.io.data_set import Data
+from lfm_ppl.io.input_table import InputTable
 from lfm_ppl.results.scalars import units_attribute
 
 GROUP = "constant_data"

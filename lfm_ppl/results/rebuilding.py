@@ -13,7 +13,7 @@ import xarray as xr
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.model_draws import ModelDraws
-from lfm_ppl.io.data_set import (
+from lfm_ppl.io.input_table import (
     OF_SERIES,
     InputTable,
     as_events,

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.io.data_set import InputTable
+from lfm_ppl.io.input_table import InputTable
 from lfm_ppl.results import inputs
 from lfm_ppl.results.scalars import scalar_draws, scalar_truth, unit_of
 

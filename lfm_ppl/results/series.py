@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from lfm_ppl.io.data_set import OF_SERIES
+from lfm_ppl.io.input_table import OF_SERIES
 from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.results.result_view import DIMENSIONS, ENTRY, SELECTED_SERIES, ResultView
 from lfm_ppl.results.scalars import unit_of, units_attribute

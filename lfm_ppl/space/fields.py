@@ -28,7 +28,8 @@ from lfm_ppl.forces.sde import ApproximationWarning, Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.space.eigenfunctions import LaplaceBasis, position_array
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import pivoted_cholesky, safe_sqrt, solve_lower
+from lfm_ppl.utils.linalg import safe_sqrt, solve_lower
+from lfm_ppl.utils.semidefinite import pivoted_cholesky
 
 _LARGEST_LOSS = 0.05
 """Share of the variance left out above which there is a warning."""

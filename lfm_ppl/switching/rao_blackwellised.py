@@ -53,8 +53,9 @@ from lfm_ppl.switching.switched_model import (
     make_interval_map,
 )
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import congruence, matmul, semidefinite_root, solve_semidefinite
+from lfm_ppl.utils.linalg import congruence, matmul
 from lfm_ppl.utils.programs import shared_jit
+from lfm_ppl.utils.semidefinite import semidefinite_root, solve_semidefinite
 
 
 class RaoBlackwellisedResult(eqx.Module):

@@ -24,8 +24,8 @@ from lfm_ppl.switching.switched_model import (
     initial_moments,
 )
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.linalg import semidefinite_root
 from lfm_ppl.utils.programs import shared_jit
+from lfm_ppl.utils.semidefinite import semidefinite_root
 
 
 class SwitchedSimulation(eqx.Module):

@@ -16,7 +16,8 @@ from lfm_ppl.inference.problem import signature
 from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.inference.trajectories import has_noise_of_rows
 from lfm_ppl.io.data import as_data
-from lfm_ppl.io.data_set import Data, at_origin, keywords_by_site, model_keywords
+from lfm_ppl.io.data_set import Data, at_origin
+from lfm_ppl.io.input_table import keywords_by_site, model_keywords
 from lfm_ppl.io.table import is_table
 from lfm_ppl.likelihoods.handlers.approximate import complete
 from lfm_ppl.model.events import Event

@@ -39,8 +39,9 @@ from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.inference.start_failure import start_failure
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.layout import Labels, checked_truth
+from lfm_ppl.results.labels import Labels
 from lfm_ppl.results.series import SERIES
+from lfm_ppl.results.true_values import checked_truth
 from lfm_ppl.storage import checkpoint as checkpoints
 from lfm_ppl.storage.checkpoint import Checkpoint
 from lfm_ppl.utils import calendar_time, checks

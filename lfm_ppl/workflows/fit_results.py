@@ -35,7 +35,8 @@ from lfm_ppl.io.data_set import Data
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import remember
-from lfm_ppl.results.layout import Labels, TrajectoryDraws, force_periods, lay_out
+from lfm_ppl.results.labels import Labels
+from lfm_ppl.results.layout import TrajectoryDraws, force_periods, lay_out
 from lfm_ppl.results.predictions import SHOWN_PERIODS, repeats_often
 from lfm_ppl.results.result_view import LIKELIHOODS
 from lfm_ppl.results.sites import merge_sites

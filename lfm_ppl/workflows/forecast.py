@@ -12,7 +12,8 @@ import xarray as xr
 
 from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.inference.trajectories import evenly_spaced, has_noise_of_rows, trajectories
-from lfm_ppl.io.data_set import OF_SERIES, Data, on_clock_of_fit
+from lfm_ppl.io.data_set import Data, on_clock_of_fit
+from lfm_ppl.io.input_table import OF_SERIES
 from lfm_ppl.model.events import Event
 from lfm_ppl.particles.particle_filter import ParticleSettings
 from lfm_ppl.results import arviz_data, rebuilding

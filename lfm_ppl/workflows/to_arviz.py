@@ -21,7 +21,9 @@ from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.trajectories import scores
 from lfm_ppl.results import arviz_data
-from lfm_ppl.results.layout import Labels, TrajectoryDraws, checked_truth
+from lfm_ppl.results.labels import Labels
+from lfm_ppl.results.layout import TrajectoryDraws
+from lfm_ppl.results.true_values import checked_truth
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.random_keys import split_by_name
 from lfm_ppl.utils.types import Result

@@ -10,13 +10,8 @@ import scipy.linalg
 from jax.test_util import check_grads
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lfm_ppl.forces.discretise import (
-    discretise,
-    discretise_dispersion,
-    discretise_steps,
-    phi_functions,
-    scalar_phi_functions,
-)
+from lfm_ppl.forces.discretise import discretise, discretise_dispersion, discretise_steps
+from lfm_ppl.forces.phi_functions import phi_functions, scalar_phi_functions
 
 step = jax.jit(discretise, static_argnums=3)
 DTS = np.array([1e-6, 0.1, 1.0, 4.0])

@@ -14,7 +14,8 @@ import lfm_ppl as lfm
 from lfm_ppl.cli import choices
 from lfm_ppl.cli.options import Columns
 from lfm_ppl.io.data import read_csv, read_series
-from lfm_ppl.io.data_set import Data, InputTable, continued_inputs, stack_series
+from lfm_ppl.io.data_set import Data, stack_series
+from lfm_ppl.io.input_table import InputTable, continued_inputs
 from lfm_ppl.io.loading import load
 from lfm_ppl.results.inputs import from_dataset, to_dataset
 

@@ -10,7 +10,7 @@ from systems import double_well, softplus
 import lfm_ppl as lfm
 from lfm_ppl.model.state_space import Span, state_space
 from lfm_ppl.particles.stochastic_steps import choose_scheme, euler, milstein, srk, step_constants
-from lfm_ppl.utils.linalg import semidefinite_root
+from lfm_ppl.utils.semidefinite import semidefinite_root
 
 PATHS, FINEST = 1500, 256
 END = 1.0

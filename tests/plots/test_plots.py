@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex
 from scipy import stats
 
-from lfm_ppl.io.data_set import InputTable
+from lfm_ppl.io.input_table import InputTable
 from lfm_ppl.plots import (
     forecasts,
     plot_deterministics,

@@ -8,7 +8,8 @@ import numpyro.distributions as dist
 import pytest
 
 import lfm_ppl as lfm
-from lfm_ppl.results.layout import Labels, TrajectoryDraws, lay_out
+from lfm_ppl.results.labels import Labels
+from lfm_ppl.results.layout import TrajectoryDraws, lay_out
 
 TIMES = np.arange(3.0)
 NAMES = ("a", "b")

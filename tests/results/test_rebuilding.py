@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
-from lfm_ppl.io.data_set import InputTable
+from lfm_ppl.io.input_table import InputTable
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import GROUP, to_dataset
 from lfm_ppl.results.rebuilding import continued_tables, keywords

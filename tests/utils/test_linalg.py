@@ -11,18 +11,8 @@ import pytest
 from scipy import stats
 
 from lfm_ppl.utils.gaussian_residuals import log_density, masked
-from lfm_ppl.utils.linalg import (
-    cholesky,
-    congruence,
-    matmul,
-    outer_square,
-    pivoted_root,
-    safe_sqrt,
-    semidefinite_root,
-    solve_lower,
-    solve_semidefinite,
-    solve_upper,
-)
+from lfm_ppl.utils.linalg import cholesky, congruence, matmul, outer_square, safe_sqrt, solve_lower, solve_upper
+from lfm_ppl.utils.semidefinite import pivoted_root, semidefinite_root, solve_semidefinite
 
 
 def definite(size, rank=None, seed=0):

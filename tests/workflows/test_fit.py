@@ -15,8 +15,9 @@ from scipy.interpolate import CubicSpline
 
 import lfm_ppl as lfm
 from lfm_ppl.results import arviz_data, rebuilding
-from lfm_ppl.results.layout import Labels, checked_truth, unplaced
+from lfm_ppl.results.labels import Labels
 from lfm_ppl.results.result_view import ResultView
+from lfm_ppl.results.true_values import checked_truth, unplaced
 from lfm_ppl.workflows import fit_starts
 from lfm_ppl.workflows.fit_options import FitOptions
 from tests.inference import linear_motif as motif

@@ -13,7 +13,7 @@ import xarray as xr
 from scipy import stats
 
 import lfm_ppl as lfm
-from lfm_ppl.io.data_set import InputTable
+from lfm_ppl.io.input_table import InputTable
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.inputs import to_dataset
 from lfm_ppl.results.predictions import noise_free_interval, summary

@@ -22,7 +22,8 @@ from lfm_ppl.filtering.ep.cavities import FactorMarginals, clip_to_proper
 from lfm_ppl.filtering.ep.quadrature import MeanVariance
 from lfm_ppl.filtering.ep.settings import FixedPointOptions
 from lfm_ppl.filtering.update import Factors
-from lfm_ppl.utils.linalg import matmul, solve_semidefinite
+from lfm_ppl.utils.linalg import matmul
+from lfm_ppl.utils.semidefinite import solve_semidefinite
 
 
 class Sweep(NamedTuple):

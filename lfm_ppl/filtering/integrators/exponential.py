@@ -34,7 +34,7 @@ from lfm_ppl.filtering.dynamics import Dynamics, covariance_of, linearize_drift,
 from lfm_ppl.filtering.integrators.integrator import Attempt, RepeatedStep, Section
 from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose, matvec, transform
 from lfm_ppl.filtering.transition import feedback, integrating_factor
-from lfm_ppl.forces.discretise import discretise_driven
+from lfm_ppl.forces.phi_functions import discretise_driven
 from lfm_ppl.utils.linalg import outer_square
 
 
