@@ -237,7 +237,7 @@ def condition(ssm: StateSpaceModel, observation: LinearizedObservation, y: jax.A
 
     Args:
         ssm: the model.
-        observation: its linearisation about the predicted moments.
+        observation: its affine map, whose point is the predicted mean.
         y: (D,), NaN where missing.
         predicted: predicted moments.
         scale: (D,), size of the outputs; None: skip the test for lost precision.

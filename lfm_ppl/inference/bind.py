@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -123,8 +123,9 @@ def bind(model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y: ArrayLi
         raise ValueError(f"the likelihood sites of the model are {sites}, and there are data of {', '.join(values)}: "
                          "pass {name: (times, y), ...} with all sites, and write numpyro.sample(name, "
                          "lfm.MarginalLikelihood(system, times[name]), obs=y[name]) in model(times, y).")
+    sites_of_other_data = bound.traced.sites_of_other_data(bound.constants) if is_by_site else []
     for name, site_model in bound.site_models.items():
-        _check_data(site_model, values[name] if is_by_site else values)
+        _check_data(site_model, values[name] if is_by_site else values, sites_of_other_data)
     return bound
 
 
@@ -145,7 +146,7 @@ def _arrays_by_site(times: Any, y: Any) -> tuple[Any, Any]:
     return {name: pair[0] for name, pair in pairs.items()}, {name: pair[1] for name, pair in pairs.items()}
 
 
-def _check_data(bound: BoundModel, values: jax.Array) -> None:
+def _check_data(bound: BoundModel, values: jax.Array, sites_of_other_data: Sequence[str]) -> None:
     """Check that a likelihood site observes the data, and their shape."""
     name, argument = bound.site.name, f"y[{bound.site.name!r}]" if bound.is_by_site else "y"
     remedy = f"Write numpyro.sample({name!r}, ..., obs={argument}), with the argument y of the model."
@@ -153,7 +154,7 @@ def _check_data(bound: BoundModel, values: jax.Array) -> None:
         raise ValueError(f"the model does not use the data: its likelihood site {name!r} is not observed. {remedy}")
     if name in bound.traced.sites_of_times:
         raise ValueError(f"the likelihood site {name!r} observes the times, not the data. {remedy}")
-    if bound.is_by_site and name in bound.traced.sites_of_other_data(bound.constants):
+    if name in sites_of_other_data:
         raise ValueError(f"the likelihood site {name!r} observes other data than those that were passed. {remedy}")
     try:
         bound.site.distribution.checked(values)

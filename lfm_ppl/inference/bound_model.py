@@ -58,8 +58,9 @@ class BoundModel:
 
         log_density(z) = log p(y | T(z)) + log p(T(z)) + log |dT/dz|.
 
-    Data, times and inputs are arguments of the compiled functions, so that another data set of the same shape compiles
-    nothing, and many data sets are a `jax.vmap`. Made by `lfm_ppl.bind`, which reads the model function, and each
+    Data are arguments of the compiled functions, and times and real arrays, too, where the model allows it
+    (`Problem.has_traced_inputs`). Another data set of the same shape then compiles nothing, and many data sets are a
+    `jax.vmap`. Made by `lfm_ppl.bind`, which reads the model function, and each
     method reads it once more at the first call, as `jax.jit` does: where a function that it calls or a variable that it
     reads has changed, bind it again.
 
@@ -75,7 +76,7 @@ class BoundModel:
         size: d.
         sites: names of the latent sites.
         model: the NumPyro model.
-        traced: the model without its data.
+        traced: the model after its run with numbers, without its data.
         problem: data, times and inputs as the argument of each program.
         model_data: the data of all sites.
         constants: the same with times and inputs as constants, for functions that need their values.
@@ -238,7 +239,7 @@ class BoundModel:
 
         Args:
             z: (d,).
-            y: data of the shape that was bound; None: the bound data.
+            y: data of the shape that was bound, or a `Problem`, as samplers pass; None: the bound data.
         """
         run = self.program("log density", lambda: Program(self._target(True)))
         return run(self._position(z), self.problem_of(y))
@@ -266,7 +267,7 @@ class BoundModel:
         """Return the log prior density of the unconstrained parameters, Jacobian included."""
         traced = self.traced
         run = self.program("log prior", lambda: Program(
-            lambda z, problem: -traced.potential(z, problem, remove_likelihood)))
+            lambda z, problem: traced.log_density(z, problem, remove_likelihood)))
         return run(self._position(z), self.problem_of(y))
 
     def site_log_priors(self, trace: Mapping[str, Any]) -> dict[str, jax.Array]:
@@ -308,11 +309,11 @@ class BoundModel:
         return Objective(minus, minus_hessian)
 
     def _target(self, jacobian: bool) -> Callable[[jax.Array, Any], jax.Array]:
-        """Return the log density of z and y, of the unconstrained or of the constrained parameters."""
+        """Return the log density of unconstrained or of constrained parameters, a function of z and a `Problem`."""
         traced = self.traced
         if jacobian:
-            return lambda z, problem: -traced.potential(z, problem)
-        return lambda z, problem: -traced.constrained_potential(z, problem)
+            return traced.log_density
+        return traced.constrained_log_density
 
     def log_density_with(self, handler: Callable[[Callable], Callable], z: ArrayLike,
                          y: ArrayLike | None = None) -> jax.Array:
@@ -323,7 +324,7 @@ class BoundModel:
             z: (d,).
             y: as in `log_density`.
         """
-        return -self.traced.potential(jnp.asarray(z, float), self._with_data(self.constants, y), handler)
+        return self.traced.log_density(jnp.asarray(z, float), self._with_data(self.constants, y), handler)
 
     # --- parameters
 

@@ -80,6 +80,7 @@ class Partition(eqx.Module):
 class Problem(eqx.Module):
     """Everything that the log density of a model is made of besides its parameters.
 
+    It is not the `FilterProblem` that a likelihood makes of its model inside the program.
     Its leaves are the arguments of compiled programs. A model may need the values of its times and arrays (a Python
     branch), or of its data, too; these are then a part of the structure.
 

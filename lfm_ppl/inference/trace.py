@@ -158,9 +158,9 @@ class TracedModel:
 
     # --- densities and parameters
 
-    def potential(self, z: jax.Array, problem: Problem,
-                  handler: Callable[[Callable], Callable] | None = None) -> Any:
-        """Return minus the log density of the unconstrained parameters, Jacobian included.
+    def log_density(self, z: jax.Array, problem: Problem,
+                    handler: Callable[[Callable], Callable] | None = None) -> Any:
+        """Return the log density of the unconstrained parameters, Jacobian included.
 
         Args:
             z: (d,).
@@ -169,13 +169,13 @@ class TracedModel:
         """
         model = self.with_times(problem)
         arguments, keywords = problem.call()
-        return potential_energy(model if handler is None else handler(model), arguments, keywords, self.unravel(z))
+        return -potential_energy(model if handler is None else handler(model), arguments, keywords, self.unravel(z))
 
-    def constrained_potential(self, z: jax.Array, problem: Problem) -> jax.Array:
-        """Return minus the log density of the constrained parameters, without the Jacobian."""
+    def constrained_log_density(self, z: jax.Array, problem: Problem) -> jax.Array:
+        """Return the log density of the constrained parameters, without the Jacobian."""
         model, (arguments, keywords) = self.with_times(problem), problem.call()
         values = constrain_fn(model, arguments, keywords, self.unravel(z))
-        return -constrained_log_density(model, arguments, keywords, values)[0]
+        return constrained_log_density(model, arguments, keywords, values)[0]
 
     def constrain(self, z: jax.Array, problem: Problem) -> dict[str, jax.Array]:
         """Return the values of the latent and of the deterministic sites."""

@@ -22,7 +22,7 @@ class FilterSettings:
         rule: linearisation rule.
         steps: integration steps between two consecutive times.
         max_step: longest step; None: twice the median step.
-        iterations: of posterior linearisation.
+        iterations: of posterior linearisation; `MarginalLikelihood` puts its default here, which depends on the model.
         damping: largest share of each new iterate that is taken.
         tolerance: largest error of an integration step, in standard deviations; None: equal steps.
         method: of integration.

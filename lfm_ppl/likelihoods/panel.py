@@ -161,10 +161,10 @@ class Panel(Likelihood):
 
     def _warn_of_long_steps(self, y: jax.Array, log_likelihood: jax.Array) -> None:
         """Warn where a step of a series is too long for a fast decay, outside of compiled code."""
-        first = self.first
-        if checks.traced((self.parameters, self.times, log_likelihood)) or not first.has_explicit_steps:
+        if checks.traced((self.parameters, self.times, log_likelihood)):
             return
-        if not np.isfinite(np.asarray(log_likelihood)).all():
+        first = self.first
+        if not first.has_explicit_steps or not np.isfinite(np.asarray(log_likelihood)).all():
             return
         explicit_steps = Program(lambda y: self.mapped(lambda series, y: series.explicit_steps(y), y))
         warn_of_message(long_step_message(explicit_steps(y), first.model.state_names, first.settings.steps))

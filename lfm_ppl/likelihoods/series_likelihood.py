@@ -2,7 +2,9 @@
 
 1. The latent force model becomes a state-space model, its times a time grid (both computed when first used).
 2. `filter` and `smooth` run on that grid with the settings of the distribution.
-3. Subclasses define the log density and its samples: `MarginalLikelihood`, `ConstrainedLikelihood` and `Switching`.
+3. `_terms_and_changes` computes the terms of a Gaussian observation: filter problem, iterations, last forward scan.
+4. Subclasses define the log density from them, and its samples: `MarginalLikelihood`, `ConstrainedLikelihood` and
+   `Switching`.
 """
 
 from __future__ import annotations

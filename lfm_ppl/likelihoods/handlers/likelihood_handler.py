@@ -73,7 +73,7 @@ class LikelihoodHandler(Handler):
         fn = msg.get("fn")
         is_selected = self.only_site is None or self.only_site == msg.get("name")
         if msg["type"] == "sample" and is_selected and isinstance(fn, Likelihood):
-            if not (fn.first.has_gaussian_state or self.supports_all_likelihoods):
+            if not (self.supports_all_likelihoods or fn.first.has_gaussian_state):
                 return
             self.has_site = True
             msg["fn"] = self.replacement(fn, msg)
