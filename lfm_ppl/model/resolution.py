@@ -1,7 +1,8 @@
 """Warnings that an approximation of a force is too coarse for the data.
 
 A squared exponential force is approximated by an SDE, a periodic force by some of its functions
-(`lfm_ppl.model.truncation`). For each squared exponential force of a model:
+(`lfm_ppl.model.truncation`), and a force of which the model is an even function is not seen at all
+(`lfm_ppl.model.even_forces`). For each squared exponential force of a model:
 
 1. Linearise the model at its prior mean (`lfm_ppl.model.linear_response`).
 2. At each frequency, compute the precision with which an evenly spaced record of the outputs determines the force: the
@@ -25,6 +26,7 @@ import numpy as np
 
 from lfm_ppl.forces.sde import ApproximationWarning, Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
+from lfm_ppl.model.even_forces import even_force_message, even_forces
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.linear_response import LEAST_NOISE, TOLERANCE, LinearizedTerm, LinearModel, linearized_terms
 from lfm_ppl.model.truncation import truncation_message, truncations
@@ -54,8 +56,9 @@ class Resolution:
 def check_resolution(model: LatentForceModel, times: Any, y: Any) -> None:
     """Warn of forces whose approximation is too coarse for the data.
 
-    These are squared exponential forces of too low an order (`resolutions`) and periodic forces of too few functions
-    (`truncations`). There is no check inside compiled code or for traced parameters.
+    These are squared exponential forces of too low an order (`resolutions`), periodic forces of too few functions
+    (`truncations`), and forces of which the model is an even function (`even_forces`). There is no check inside compiled code or for traced
+    parameters.
 
     Args:
         model: the latent force model.
@@ -63,7 +66,7 @@ def check_resolution(model: LatentForceModel, times: Any, y: Any) -> None:
         y: (T, D), NaN where missing.
 
     Warns:
-        ApproximationWarning: the estimated error of the log likelihood exceeds 0.1.
+        ApproximationWarning: the estimated error of the log likelihood exceeds 0.1, or a force is not seen.
     """
     for message in resolution_messages(model, times, y):
         warnings.warn(message, ApproximationWarning, stacklevel=4)
@@ -71,8 +74,9 @@ def check_resolution(model: LatentForceModel, times: Any, y: Any) -> None:
 
 def resolution_messages(model: LatentForceModel, times: Any, y: Any) -> list[str]:
     """Return the warnings of `check_resolution`, one for each force that is too coarse; arguments as there."""
-    return [_message(resolution) for resolution in resolutions(model, times, y) if resolution.error > TOLERANCE] + [
-        truncation_message(truncation) for truncation in truncations(model, times, y) if truncation.error > TOLERANCE]
+    return [*(_message(resolution) for resolution in resolutions(model, times, y) if resolution.error > TOLERANCE),
+            *(truncation_message(item) for item in truncations(model, times, y) if item.error > TOLERANCE),
+            *(even_force_message(name) for name in even_forces(model, times))]
 
 
 def resolutions(model: LatentForceModel, times: Any, y: Any = None) -> list[Resolution]:

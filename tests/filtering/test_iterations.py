@@ -16,6 +16,7 @@ from systems import DoubleWell, double_well, identity, motif, softplus
 import lfm_ppl as lfm
 from lfm_ppl.filtering.iterated import limit_variance
 from lfm_ppl.filtering.moments import Moments
+from lfm_ppl.model.even_forces import even_forces
 
 TIMES = np.array([0.4, 1.1, 1.9, 2.6])
 Y = np.array([0.3, 0.8, 0.5, 0.9])[:, None]
@@ -225,7 +226,7 @@ def particle_log_likelihood(model, times, y, runs=8, particles=20_000, seed=0) -
 
 @pytest.mark.slow
 def test_the_default_is_near_particles_for_random_models():
-    """Of 12 models whose exact likelihood particles estimate well."""
+    """Of 12 models whose exact likelihood particles estimate well; an error above 1 has a warning."""
     errors, settled = [], []
     for model, times, y in random_nonlinear_models(24):
         exact, standard_error = particle_log_likelihood(model, times, y)
@@ -233,8 +234,7 @@ def test_the_default_is_near_particles_for_random_models():
             continue
         result = jax.jit(lambda model, y, times=times: lfm.smooth(model, times, y))(model, y)
         errors.append(abs(float(result.log_likelihood.sum()) - exact))
-        settled.append(bool(has_settled(result.change, result.log_likelihood_change)))
-        print(np.round(errors[-1], 3), np.round(standard_error, 3), float(result.change), settled[-1])
+        settled.append(bool(has_settled(result.change, result.log_likelihood_change)) and not even_forces(model, times))
         jax.clear_caches()
         if len(errors) == 12:
             break
