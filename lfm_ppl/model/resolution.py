@@ -57,8 +57,8 @@ def check_resolution(model: LatentForceModel, times: Any, y: Any) -> None:
     """Warn of forces whose approximation is too coarse for the data.
 
     These are squared exponential forces of too low an order (`resolutions`), periodic forces of too few functions
-    (`truncations`), and forces of which the model is an even function (`even_forces`). There is no check inside compiled code or for traced
-    parameters.
+    (`truncations`), and forces of which the model is an even function (`even_forces`). There is no check inside
+    compiled code or for traced parameters.
 
     Args:
         model: the latent force model.
