@@ -87,7 +87,7 @@ def rod(times, y=None):
          "space_lengthscale": numpyro.sample("space_lengthscale", dist.LogNormal(-1.2, 0.4)),
          "time_lengthscale": numpyro.sample("time_lengthscale", dist.LogNormal(1.2, 0.7))}
     noise_sd = numpyro.sample("noise_sd", dist.HalfNormal(0.5))
-    model = lfm.heat(heat_source(p), DIFFUSIVITY, DECAY, sensors=sensors, noise=noise_sd**2,
+    model = lfm.heat(heat_source(p), DIFFUSIVITY, DECAY, sensors=sensors, sd=noise_sd,
                      output_names=list(UNITS)[1:], units=UNITS)
     numpyro.sample("y", lfm.MarginalLikelihood(model, times), obs=y)
 
