@@ -248,7 +248,7 @@ def moving_horizon(model: LatentForceModel, times: ArrayLike, y: ArrayLike, wind
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
         ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> y = -jnp.ones((6, 1))
-        >>> bool(lfm.moving_horizon(model, np.arange(6.0), y, window=4, lower={"u": 0.0}).force("u").min() >= 0)
+        >>> bool(lfm.moving_horizon(model, np.arange(6.0), y, window=4, lower={"u": 0.0}).force("u").mean.min() >= 0)
         True
 
     Source: Wolff, Lopez, Müller and Beckers, equations 13 to 17.
