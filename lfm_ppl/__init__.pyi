@@ -23,6 +23,7 @@ from .forces import QuasiPeriodic as QuasiPeriodic
 from .forces import Resonator as Resonator
 from .forces import SquaredExponential as SquaredExponential
 from .forces import WienerVelocity as WienerVelocity
+from .forces import priors as priors
 from .inference.bind import bind as bind
 from .inference.bound_model import BoundModel as BoundModel
 from .inference.kernels.elliptical_slice import EllipticalSlice as EllipticalSlice

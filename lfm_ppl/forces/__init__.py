@@ -3,6 +3,7 @@
 The public names are exported here as `lfm_ppl.forces.NAME`; the most common ones are also `lfm_ppl.NAME`.
 """
 
+from lfm_ppl.forces import priors as priors
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.matern import Matern
 from lfm_ppl.forces.periodic_kernels import (
