@@ -5,8 +5,7 @@ import os
 import jaxlib.version
 import pytest
 
-import lfm_ppl as lfm
-from lfm_ppl.utils.compilation import quick_compilation
+from lfm_ppl.utils.compilation import fast_loops, quick_compilation
 
 OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
@@ -23,9 +22,9 @@ def test_fast_loops_join_the_flags_that_are_there(monkeypatch, before, after):
         monkeypatch.delenv("XLA_FLAGS", raising=False)
     else:
         monkeypatch.setenv("XLA_FLAGS", before)
-    lfm.fast_loops()
+    fast_loops()
     assert os.environ["XLA_FLAGS"] == after
-    lfm.fast_loops()
+    fast_loops()
     assert os.environ["XLA_FLAGS"] == after, "once is enough"
 
 
