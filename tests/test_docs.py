@@ -14,7 +14,6 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import orbits
-from lfm_ppl.accuracy import calibration
 from lfm_ppl.cli import main
 from lfm_ppl.io import loading
 
@@ -26,8 +25,8 @@ DATA = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data"))
 
 def public():
     """Yield (name, function) of every public function, and of every public method of a public class."""
-    for module in (lfm, lfm.forces, lfm.priors, orbits, calibration):
-        for name in getattr(module, "__all__", ("calibrate",)):
+    for module in (lfm, lfm.forces, lfm.priors, orbits):
+        for name in module.__all__:
             value = getattr(module, name)
             if inspect.isclass(value) and value.__module__.startswith("lfm_ppl"):
                 yield name, value.__init__

@@ -125,7 +125,7 @@ class ResultView:
         """Raise ValueError for a result with several likelihood sites, of which one has to be selected."""
         if names := list(self.likelihood_sites):
             raise ValueError(f"the result has the likelihood sites {', '.join(names)}, and this takes one; select it: "
-                             f"lfm.select_site(result, {names[0]!r}).")
+                             f"lfm.select_series(result, {names[0]!r}).")
 
     @property
     def is_part(self) -> bool:

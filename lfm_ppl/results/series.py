@@ -20,6 +20,7 @@ from lfm_ppl.io.data_set import OF_SERIES
 from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.results.result_view import DIMENSIONS, ENTRY, SELECTED_SERIES, ResultView
 from lfm_ppl.results.scalars import unit_of, units_attribute
+from lfm_ppl.results.sites import site_view
 from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:  # figures need no JAX
@@ -55,22 +56,24 @@ def time_coordinate(name: str, times: np.ndarray, panel: tuple[str, ...], units:
 
 
 def select_series(result: Any, series: Any) -> Any:
-    """Return one series of a panel as a result of one series, for figures, tables and the report.
+    """Return one series of a panel, or one of several likelihood sites, as a result of one series.
 
-    Rows that pad the series, all missing at the time of the row before, are left out, and so is the accuracy report,
-    which is about the panel. Parameters that series share stay as they are.
+    Figures, tables, scores and reports of one series take it. Rows that pad the series, all missing at the time of the
+    row before, are left out, and so is the accuracy report, which is about the panel. Parameters that series share stay
+    as they are. The observations of a likelihood site are called ``y``, whatever its name.
 
     Args:
-        result: of a panel.
-        series: label of the series, or its position where no label equals it.
+        result: what `lfm_ppl.fit` or `lfm_ppl.forecast` returned for a panel, or for a model with several likelihood
+            sites.
+        series: label of the series, or its position where no label equals it; name of the site.
 
     Returns:
-        An ArviZ object with the names and dimensions of a result of one series. Its attribute ``selected``
-        names the series. `lfm_ppl.forecast` takes it with the model of the panel; `lfm_ppl.check_accuracy` takes the
-        panel instead.
+        An ArviZ object with the names and dimensions of a result of one series, which shares the arrays of ``result``.
+        Its attribute ``selected`` names the series of a panel. `lfm_ppl.forecast` takes it with the model of the panel
+        or of all sites; `lfm_ppl.check_accuracy` takes the whole result instead.
 
     Raises:
-        ValueError: the result is of one series, or has no such series.
+        ValueError: the result is of one series, or has no such series or site.
 
     Example:
         >>> y = xr.Dataset({"y": (("patient", "time", "output"), np.arange(4.0).reshape(2, 2, 1))})
@@ -81,7 +84,8 @@ def select_series(result: Any, series: Any) -> Any:
         >>> one["data"]["y"].values.ravel().tolist(), one["posterior"]["rate"].dims
         ([2.0, 3.0], ('chain', 'draw'))
     """
-    selected = series_view(ResultView.of(result), series)
+    view = ResultView.of(result)
+    selected = site_view(view, series) if view.likelihood_sites else series_view(view, series)
     return arviz_data.build(selected.groups, selected.attrs)
 
 
