@@ -118,18 +118,19 @@ def _checked_covariance(covariance: Any) -> Any:
 def _covariance_of_sd(sd: Any, function: Callable[..., jax.Array]) -> Any:
     """Return the covariance of independent errors: () or (D,) of one sd or (D,), (T, D, D) of (T, D), or a function."""
     if callable(sd):
-        def variances(x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
+        def variance(x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
             value = jnp.asarray(sd(x, u, t), float)
             if value.ndim > 1:
                 raise ValueError(f"sd must return a number or a vector (D,), got shape {value.shape}; a matrix is a "
                                  "covariance=.")
             return value**2 if value.ndim else jnp.full(jax.eval_shape(function, x, u, t).shape, value**2)
 
-        return variances
+        return variance
     checks.finite("sd", sd)
+    if np.ndim(sd) > 2:
+        raise ValueError(f"sd must be a number, (D,) or one row per observation (T, D), got shape {np.shape(sd)}.")
     values = checks.concrete(sd)
-    if np.ndim(sd) > 2 or values is not None and np.any(values < 0):
-        raise ValueError("sd must be a number, (D,) or (T, D) of numbers that are not negative, got "
-                         f"{f'shape {np.shape(sd)}' if np.ndim(sd) > 2 else f'{np.min(values):g}'}.")
+    if values is not None and np.any(values < 0):
+        raise ValueError(f"sd must not be negative, got {np.min(values):g}.")
     variances = jnp.asarray(sd, float) ** 2
     return jax.vmap(jnp.diag)(variances) if variances.ndim == 2 else variances
