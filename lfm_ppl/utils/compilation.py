@@ -69,11 +69,12 @@ def prepare_chains(chains: int) -> None:
     """Give JAX a CPU device for each chain, and `fast_loops`; without effect after its first computation.
 
     JAX fixes the devices, and reads XLA's flags, at that computation. A number of devices that is set already, by
-    ``numpyro.set_host_device_count`` or JAX's own option, stays.
+    ``numpyro.set_host_device_count`` or JAX's own option, stays. Devices of a process with one thread would only take
+    turns, so it keeps one.
     """
     import jax
 
-    if jax.config.jax_num_cpu_devices >= 0:  # type: ignore[attr-defined]
+    if one_thread() or jax.config.jax_num_cpu_devices >= 0:  # type: ignore[attr-defined]
         return
     flag = re.search(rf"{_DEVICES}=(\d+)", os.environ.get("XLA_FLAGS", ""))
     try:
