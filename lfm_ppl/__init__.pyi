@@ -7,7 +7,6 @@ from .accuracy.check_accuracy import check_accuracy as check_accuracy
 from .accuracy.correction import correct_posterior as correct_posterior
 from .constrained.full_information import full_information as full_information
 from .constrained.moving_horizon import MovingHorizon as MovingHorizon
-from .constrained.moving_horizon import moving_horizon as moving_horizon
 from .constrained.posterior import constrained_posterior as constrained_posterior
 from .filtering.breakdown import FilterWarning as FilterWarning
 from .filtering.ep.settings import FactorSettings as FactorSettings

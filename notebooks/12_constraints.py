@@ -13,7 +13,7 @@
 #
 # A concentration cannot be negative, but a Gaussian process can. Those who build moving horizon estimators respect such
 # bounds and have no posterior; those who have posteriors rarely respect them. Here are both:
-# `lfm.full_information`, `lfm.moving_horizon` and `lfm.constrained_posterior`, in time linear in the record.
+# `lfm.full_information`, `lfm.MovingHorizon` and `lfm.constrained_posterior`, in time linear in the record.
 #
 # The source is T. M. Wolff, V. G. Lopez, M. A. Müller and T. Beckers, *Inference in latent force models using optimal
 # state estimation*. The same study runs from the command line, where it can be stopped and resumed:

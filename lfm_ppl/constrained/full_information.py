@@ -38,7 +38,7 @@ from lfm_ppl.utils.programs import shared_jit
 
 
 class ConstrainedEstimate(eqx.Module):
-    """Result of `full_information` and `lfm_ppl.moving_horizon`.
+    """Result of `full_information` and `lfm_ppl.MovingHorizon.estimate`.
 
     Attributes:
         times: (K,), times at which the constraints hold.

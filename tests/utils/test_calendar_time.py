@@ -268,7 +268,7 @@ REFUSALS = {
     "simulate": lambda times: lfm.simulate(jax.random.key(0), system(), times),
     "Input": lambda times: lfm.Input(times, np.zeros(3)),
     "full_information": lambda times: lfm.full_information(system(), times, np.zeros((3, 1)), lower={"u": 0.0}),
-    "moving_horizon": lambda times: lfm.moving_horizon(system(), times, np.zeros((3, 1)), 3, lower={"u": 0.0}),
+    "moving_horizon": lambda times: lfm.MovingHorizon(system(), 3, lower={"u": 0.0}).estimate(times, np.zeros((3, 1))),
     "backtest": lambda times: lfm.backtest(model, times, np.zeros((3, 1)), horizon=1),
     "fit_many": lambda times: lfm.fit_many(model, {"a": (times, np.zeros((3, 1)))}),
     "initial time": lambda times: system(initial_time=times[0]),
