@@ -163,7 +163,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
     panel = () if labels.series is None else (labels.series,)
     along = (*panel, "time")
     coords: dict[str, Any] = {"chain": np.arange(chains), "draw": np.arange(samples)}
-    clock: dict[str, Any] = time_coordinate("time", times, panel, units)
+    clock: dict[str, Any] = time_coordinate(times, panel, units)
     outputs = labels.coords.get(OUTPUT, list(model.output_names))
     units = units | {new: units[old] for old, new in zip(model.output_names, outputs, strict=True) if old in units}
     named = {"output": outputs, "state": list(model.state_names), "force": list(model.force_names),
@@ -204,12 +204,12 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
              "residual": variable((*sample, "output"), split["residual"])}, {**coords, **data_coords})
     if paths is not None:
         thinned = {"chain": np.arange(chains), "draw": draw_index}
-        dimensions = ("chain", "draw", *panel, "at")
-        at_coords = {} if grid is None else time_coordinate("at", grid, panel, units)
+        dimensions = ("chain", "draw", *panel, "time")
+        path_coords = {} if grid is None else time_coordinate(grid, panel, units)
         groups["trajectories"] = xr.Dataset(
             {f"{kind}s": variable((*dimensions, kind), paths[kind], named[kind])
              for kind in named if paths[kind].shape[-1]},
-            {**thinned, **at_coords, **which, **{kind: named[kind] for kind in named if named[kind]}})
+            {**thinned, **path_coords, **which, **{kind: named[kind] for kind in named if named[kind]}})
         groups["trajectories"]["outputs"].attrs["long_name"] = NOISE_FREE
         if periods := force_periods(model):
             groups["trajectories"]["forces"].attrs[PERIODS] = json.dumps(periods)
@@ -221,7 +221,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
     if truth:
         groups["truth"] = _truth(truth, named, units, groups["posterior"])
         for kind, values in _true_functions(bound, truth, draws).items():
-            new = {f"{kind}s": variable(("at_truth", kind), values, named[kind])}
+            new = {f"{kind}s": variable(("time", kind), values, named[kind])}
             truth_group = groups["truth"]
             if f"{kind}s" in truth_group:  # some of them, by the user
                 truth_group = truth_group.drop_dims(kind)
@@ -409,18 +409,18 @@ def _truth(truth: Mapping[str, Any], named: dict, units: Mapping[str, str],
     variables: dict[str, Any] = {}
     coords: dict[str, Any] = {}
     if truth.get("times") is not None:
-        coords["at_truth"] = ("at_truth", np.asarray(truth["times"], float), units_attribute(["time"], units))
+        coords["time"] = ("time", np.asarray(truth["times"], float), units_attribute(["time"], units))
     for kind in ("force", "deterministic"):
         paths = truth.get(f"{kind}s") or {}
         stored_labels = [label for label in named[kind] if label in paths]
         if stored_labels:
             coords[kind] = stored_labels
             values = np.stack([np.asarray(paths[label]) for label in stored_labels], axis=1)
-            variables[f"{kind}s"] = (("at_truth", kind), values,
+            variables[f"{kind}s"] = (("time", kind), values,
                                      units_attribute(stored_labels, units))
     if _true_states(truth).shape[1:] == (len(named["state"]),):
         coords["state"] = named["state"]
-        variables["states"] = (("at_truth", "state"), np.asarray(truth["state"]),
+        variables["states"] = (("time", "state"), np.asarray(truth["state"]),
                                units_attribute(named["state"], units))
     for label, value in (truth.get("parameters") or {}).items():
         value = np.asarray(value, float)

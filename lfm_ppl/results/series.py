@@ -44,14 +44,14 @@ def plate_dimension(bound: BoundModel) -> str | None:
     return plates[0] if len(plates) == 1 and plates[0] not in DIMENSIONS else SERIES
 
 
-def times_of(dataset: xr.Dataset, clock: str = "time") -> xr.DataArray:
-    """Return the times along the dimension ``clock`` of a group, (K,), or (B, K) where series have their own."""
-    return dataset[TIMES] if TIMES in dataset.variables else dataset[clock]
+def times_of(dataset: xr.Dataset) -> xr.DataArray:
+    """Return the times of a group, (K,), or (B, K) where series have their own."""
+    return dataset[TIMES] if TIMES in dataset.variables else dataset["time"]
 
 
-def time_coordinate(name: str, times: np.ndarray, panel: tuple[str, ...], units: Mapping[str, str]) -> dict[str, Any]:
-    """Return the coordinate of times (K,) along the dimension ``name``, or (B, K) of series that have their own."""
-    label, dims = (name, (name,)) if np.ndim(times) == 1 else (TIMES, (*panel, name))
+def time_coordinate(times: np.ndarray, panel: tuple[str, ...], units: Mapping[str, str]) -> dict[str, Any]:
+    """Return the coordinate of times (K,) along the dimension "time", or (B, K) of series that have their own."""
+    label, dims = ("time", ("time",)) if np.ndim(times) == 1 else (TIMES, (*panel, "time"))
     return {label: (dims, times, units_attribute(["time"], units))}
 
 
@@ -105,7 +105,10 @@ def series_view(view: ResultView, series: Any) -> ResultView:
         if label in _NOT_OF_SERIES:
             continue
         dataset = _select(dataset, dimension, index, labels[index])
-        if label in ("data", "one_step_ahead"):
+        if label == "trajectories" and TIMES in view.groups[label].variables:
+            # The times of trajectories are padded by the last one.
+            dataset = dataset.isel(time=np.diff(dataset["time"].values, prepend=-np.inf) > 0)
+        elif label in ("data", "one_step_ahead"):
             dataset = dataset.isel(time=is_observed[index] | is_later)
         elif label in (inputs.GROUP, inputs.FORECAST):
             dataset = _select_inputs(view.group(label), str(labels[index]))
@@ -198,10 +201,8 @@ def _select(dataset: xr.Dataset, dimension: str, index: int, label: Any) -> xr.D
         dataset = dataset.isel({dimension: index}, drop=True)
     if TIMES not in dataset.variables:
         return dataset
-    clock, times = "at" if "at" in dataset.dims else "time", dataset[TIMES]
-    dataset = dataset.drop_vars(TIMES).assign_coords({clock: (clock, times.values, times.attrs)})
-    # The times of trajectories are padded by the last one.
-    return dataset.isel(at=np.diff(times.values, prepend=-np.inf) > 0) if clock == "at" else dataset
+    times = dataset[TIMES]
+    return dataset.drop_vars(TIMES).assign_coords(time=("time", times.values, times.attrs))
 
 
 def _select_mode(view: ResultView, dimension: str, index: int) -> dict[str, Any]:

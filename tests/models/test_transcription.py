@@ -135,9 +135,9 @@ def test_p53_posterior(file):
     assert z.abs().max() < 4.0, z.round(1).to_dict()
 
     forces = ResultView.of(nuts).group("trajectories")["forces"].isel(force=0)
-    peak = forces["at"].values[forces.mean(["chain", "draw"]).values.argmax()]
+    peak = forces["time"].values[forces.mean(["chain", "draw"]).values.argmax()]
     assert peak < 6.0
-    each = forces["at"].values[forces.values.argmax(axis=forces.dims.index("at"))]
+    each = forces["time"].values[forces.values.argmax(axis=forces.dims.index("time"))]
     assert np.mean(each < 6.0) > 0.9
 
 

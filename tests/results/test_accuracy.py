@@ -312,7 +312,7 @@ def test_correction_keeps_data_truth_and_the_layout_of_trajectories(checked):
     corrected = correct_posterior(result, well, trajectory_draws=6)
     old, new = (ResultView.of(one).group("trajectories") for one in (result, corrected))
     assert new["states"].dims == old["states"].dims and new["states"].shape == (1, 6, *old["states"].shape[2:])
-    np.testing.assert_array_equal(new["at"], old["at"])
+    np.testing.assert_array_equal(new["time"], old["time"])
     chains, draws = (ResultView.of(corrected).posterior.sizes[name] for name in ("chain", "draw"))
     for name in ("log_likelihood", "posterior_predictive"):
         assert ResultView.of(corrected).group(name)["y"].shape[:2] == (chains, draws)
