@@ -2,11 +2,11 @@
 
 from . import forces as forces
 from . import orbits as orbits
+from .accuracy.calibration import calibrate as calibrate
 from .accuracy.check_accuracy import check_accuracy as check_accuracy
 from .accuracy.correction import correct_posterior as correct_posterior
 from .constrained.full_information import full_information as full_information
 from .constrained.moving_horizon import MovingHorizon as MovingHorizon
-from .constrained.moving_horizon import moving_horizon as moving_horizon
 from .constrained.posterior import constrained_posterior as constrained_posterior
 from .filtering.breakdown import FilterWarning as FilterWarning
 from .filtering.ep.settings import FactorSettings as FactorSettings
@@ -23,6 +23,7 @@ from .forces import QuasiPeriodic as QuasiPeriodic
 from .forces import Resonator as Resonator
 from .forces import SquaredExponential as SquaredExponential
 from .forces import WienerVelocity as WienerVelocity
+from .forces import priors as priors
 from .inference.bind import bind as bind
 from .inference.bound_model import BoundModel as BoundModel
 from .inference.kernels.elliptical_slice import EllipticalSlice as EllipticalSlice
@@ -31,8 +32,10 @@ from .inference.kernels.ram import RAM as RAM
 from .inference.map import map_estimate as map_estimate
 from .io import data as data
 from .io.data import read_csv as read_csv
+from .io.data import read_series as read_series
 from .io.data import read_table as read_table
 from .io.data_set import Data as Data
+from .io.data_set import stack_series as stack_series
 from .latent_grid.laplace import laplace as laplace
 from .latent_grid.latent_grid import LatentGrid as LatentGrid
 from .likelihoods.constrained_likelihood import ConstrainedLikelihood as ConstrainedLikelihood
@@ -59,14 +62,13 @@ from .model.observations.censored import CensoredObservation as CensoredObservat
 from .model.observations.counts import NegativeBinomialObservation as NegativeBinomialObservation
 from .model.observations.counts import PoissonObservation as PoissonObservation
 from .model.observations.family import ObservationFamily as ObservationFamily
-from .model.observations.generic import Observation as Observation
+from .model.observations.generic import DistributionObservation as DistributionObservation
 from .model.observations.side_by_side import Observations as Observations
 from .model.observations.student_t import StudentTObservation as StudentTObservation
 from .model.observations.successes import BernoulliObservation as BernoulliObservation
 from .model.observations.successes import BinomialObservation as BinomialObservation
 from .model.simulate import Simulation as Simulation
 from .model.simulate import simulate as simulate
-from .model.state_space import state_space as state_space
 from .particles.particle_filter import particle_filter as particle_filter
 from .particles.particle_smoother import particle_smoother as particle_smoother
 from .plots import plot_accuracy as plot_accuracy
@@ -83,10 +85,10 @@ from .plots import plot_trace as plot_trace
 from .report.html_report import save_report as save_report
 from .results.arviz_data import load as load
 from .results.arviz_data import save as save
+from .results.arviz_data import summary as summary
 from .results.fields import evaluate_field as evaluate_field
 from .results.scoring import score as score
 from .results.series import select_series as select_series
-from .results.sites import select_site as select_site
 from .space.eigenfunctions import LaplaceBasis as LaplaceBasis
 from .space.equations import heat as heat
 from .space.equations import wave as wave
@@ -97,7 +99,6 @@ from .switching.controller import Thermostat as Thermostat
 from .switching.rao_blackwellised import rao_blackwellised as rao_blackwellised
 from .switching.switched_simulation import simulate_switched as simulate_switched
 from .switching.switching_likelihood import Switching as Switching
-from .utils.compilation import fast_loops as fast_loops
 from .workflows.backtest import Backtest as Backtest
 from .workflows.backtest import backtest as backtest
 from .workflows.fit import fit as fit

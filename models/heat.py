@@ -65,7 +65,7 @@ def build(diffusivity, decay, scale, space_lengthscale, time_lengthscale, noise_
     process = source({"scale": scale, "space_lengthscale": space_lengthscale, "time_lengthscale": time_lengthscale},
                      length, modes)
     initial = lfm.Gaussian(jnp.zeros(modes), (INITIAL_SD / scale * process.amplitudes)**2)
-    return lfm.heat(process, diffusivity, decay, sensors=positions(outputs), noise=noise_sd**2, initial=initial,
+    return lfm.heat(process, diffusivity, decay, sensors=positions(outputs), sd=noise_sd, initial=initial,
                     output_names=outputs, units=units)
 
 

@@ -101,8 +101,8 @@ lfm.plot_fit(result, width="full")
 # %%
 trajectories = result["trajectories"]
 force = trajectories["forces"].isel(force=0).stack(sample=("chain", "draw"))
-activity = np.asarray(jax.nn.softplus(force.transpose("at", "sample").values))
-hours = trajectories["at"].values
+activity = np.asarray(jax.nn.softplus(force.transpose("time", "sample").values))
+hours = trajectories["time"].values
 figure, axes = plt.subplots(figsize=(7.0, 2.6), layout="constrained")
 low, middle, high = np.quantile(activity, [0.025, 0.5, 0.975], axis=1)
 axes.fill_between(hours, low, high, alpha=0.3, linewidth=0, label="95%")
@@ -208,10 +208,10 @@ figure, panels = plt.subplots(1, 4, figsize=(7.0, 2.2), layout="constrained")
 for axes, colour, (link, one) in zip(panels, colours, results.items(), strict=True):
     trajectories = one["trajectories"]
     force = trajectories["forces"].isel(force=0).stack(sample=("chain", "draw"))
-    activity = np.asarray(response(jax.numpy.asarray(force.transpose("at", "sample").values), link, gamma))
+    activity = np.asarray(response(jax.numpy.asarray(force.transpose("time", "sample").values), link, gamma))
     low, middle, high = np.quantile(activity, [0.025, 0.5, 0.975], axis=1)
-    axes.fill_between(trajectories["at"].values, low, high, color=colour, alpha=0.3, linewidth=0)
-    axes.plot(trajectories["at"].values, middle, color=colour)
+    axes.fill_between(trajectories["time"].values, low, high, color=colour, alpha=0.3, linewidth=0)
+    axes.plot(trajectories["time"].values, middle, color=colour)
     axes.set(title=link, xlabel="time (h)", ylim=(min(0.0, low.min()), None))
 panels[0].set_ylabel("activity, with 95%")
 plt.show()

@@ -13,7 +13,7 @@
 #
 # A concentration cannot be negative, but a Gaussian process can. Those who build moving horizon estimators respect such
 # bounds and have no posterior; those who have posteriors rarely respect them. Here are both:
-# `lfm.full_information`, `lfm.moving_horizon` and `lfm.constrained_posterior`, in time linear in the record.
+# `lfm.full_information`, `lfm.MovingHorizon` and `lfm.constrained_posterior`, in time linear in the record.
 #
 # The source is T. M. Wolff, V. G. Lopez, M. A. Müller and T. Beckers, *Inference in latent force models using optimal
 # state estimation*. The same study runs from the command line, where it can be stopped and resumed:
@@ -54,8 +54,8 @@ model = problem.transcription(scale=1.0, lengthscale=1.0)
 times, y, truth = problem.TIMES[few], record.y[few], record.force[few]
 smoothed = lfm.smooth(model, times, y).force("factor").mean
 computed = lfm.full_information(model, times, y, lower={"factor": 0.0}, grid=times)
-pd.DataFrame({"least": [smoothed.min(), computed.force("factor").min()],
-              "MSE": [np.mean((a - truth) ** 2) for a in (smoothed, computed.force("factor"))]},
+pd.DataFrame({"least": [smoothed.min(), computed.force("factor").mean.min()],
+              "MSE": [np.mean((a - truth) ** 2) for a in (smoothed, computed.force("factor").mean)]},
              ["smoother", "full information"])
 
 # %% [markdown]
@@ -96,7 +96,7 @@ states = lfm.full_information(problem.companion(1.0, np.zeros(3), learnt=True), 
                               lower={"factor": 0.0, "rate": 0.0}, grid=times, tolerance=1e-8)
 learning = problem.learning("all")
 likeliest = estimators.posterior_mode(learning, record.y)
-pd.Series({"a state, Q constant": float(np.sqrt(3.0) / states.state("rate")[0]),
+pd.Series({"a state, Q constant": float(np.sqrt(3.0) / states.state("rate").mean[0]),
            "a state, Q with it": estimators.learn_rate_as_state("weight", record.y[None])[0, 0],
            "marginal likelihood": np.exp(likeliest[0])}, name="lengthscale (s)").round(2)
 

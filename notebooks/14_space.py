@@ -87,7 +87,7 @@ def rod(times, y=None):
          "space_lengthscale": numpyro.sample("space_lengthscale", dist.LogNormal(-1.2, 0.4)),
          "time_lengthscale": numpyro.sample("time_lengthscale", dist.LogNormal(1.2, 0.7))}
     noise_sd = numpyro.sample("noise_sd", dist.HalfNormal(0.5))
-    model = lfm.heat(heat_source(p), DIFFUSIVITY, DECAY, sensors=sensors, noise=noise_sd**2,
+    model = lfm.heat(heat_source(p), DIFFUSIVITY, DECAY, sensors=sensors, sd=noise_sd,
                      output_names=list(UNITS)[1:], units=UNITS)
     numpyro.sample("y", lfm.MarginalLikelihood(model, times), obs=y)
 
@@ -114,7 +114,7 @@ places = np.linspace(0.0, 1.0, 81)
 estimate = lfm.evaluate_field(result, heat_source, places)
 figure, axes = plt.subplots(1, 3, figsize=(7, 2.4), sharey=True, layout="constrained")
 for axis, k in zip(axes, (8, 20, 32), strict=True):
-    mean, sd = (estimate[name].sel(at=times[k], method="nearest").values for name in ("mean", "sd"))
+    mean, sd = (estimate[name].sel(time=times[k], method="nearest").values for name in ("mean", "sd"))
     axis.fill_between(places, mean - 1.96 * sd, mean + 1.96 * sd, color="#8FBFDE", lw=0, label="95%")
     axis.plot(places, mean, color="#0072B2", label="posterior mean")
     axis.plot(places, flame(places, times[k]), color="black", ls="--", lw=0.9, label="flame")
@@ -182,7 +182,7 @@ lfm.plot_field(intensity, rate_field, sensors=cells, name="log rate", width="ful
 
 # %%
 estimate = lfm.evaluate_field(intensity, rate_field, cells)
-mean, sd = (estimate[name].sel(at=periods, method="nearest").values for name in ("mean", "sd"))
+mean, sd = (estimate[name].sel(time=periods, method="nearest").values for name in ("mean", "sd"))
 figure, axis = plt.subplots(figsize=(3.4, 2.8), layout="constrained")
 axis.errorbar(log_rate.ravel(), mean.ravel(), 1.96 * sd.ravel(), fmt="o", ms=2, lw=0.4, color="#0072B2")
 ends = [log_rate.min(), log_rate.max()]

@@ -57,17 +57,17 @@ def trajectories(rng):
     return xr.Dataset(
         {
             "forces": (
-                ("chain", "draw", "at", "force"),
+                ("chain", "draw", "time", "force"),
                 force + smooth_noise(rng, time, 0.15, 2),
                 units_attribute(FORCES, UNITS),
             ),
-            "states": (("chain", "draw", "at", "state"), 1.1 * output, {"units": "nM"}),
-            "outputs": (("chain", "draw", "at", "output"), output, units_attribute(GENES, UNITS)),
+            "states": (("chain", "draw", "time", "state"), 1.1 * output, {"units": "nM"}),
+            "outputs": (("chain", "draw", "time", "output"), output, units_attribute(GENES, UNITS)),
         },
         coords={
             "chain": np.arange(CHAINS),
             "draw": np.arange(THINNED) * 2,
-            "at": ("at", time, {"units": "h"}),
+            "time": ("time", time, {"units": "h"}),
             "force": list(FORCES),
             "state": [f"{gene}_mRNA" for gene in GENES],
             "output": list(GENES),
@@ -119,13 +119,13 @@ def truth():
     time = np.linspace(0.0, 12.0, 49)
     return xr.Dataset(
         {
-            "forces": (("at_truth", "force"), np.stack([true_force(time, f) for f in FORCES], axis=-1)),
-            "states": (("at_truth", "state"), 1.1 * np.stack([true_output(time, g) for g in range(3)], axis=-1)),
+            "forces": (("time", "force"), np.stack([true_force(time, f) for f in FORCES], axis=-1)),
+            "states": (("time", "state"), 1.1 * np.stack([true_output(time, g) for g in range(3)], axis=-1)),
             "decay": ("gene", DECAY),
             "lengthscale": ((), 2.0),
         },
         coords={
-            "at_truth": time,
+            "time": time,
             "force": list(FORCES),
             "state": [f"{gene}_mRNA" for gene in GENES],
             "gene": list(GENES),
@@ -230,8 +230,8 @@ def crowded():
             "posterior": posterior,
             "data": xr.Dataset({"y": (("time", "output"), y, units)}, coords=over),
             "trajectories": xr.Dataset(
-                {"outputs": ((*sample, "at", "output"), wave[1] + 1e-5 * rng.normal(size=(4, 25, 1, 15)))},
-                coords={"at": at, "output": names},
+                {"outputs": ((*sample, "time", "output"), wave[1] + 1e-5 * rng.normal(size=(4, 25, 1, 15)))},
+                coords={"time": at, "output": names},
             ),
             "one_step_ahead": xr.Dataset({"residual": ((*sample, "time", "output"), noisy)}, coords=over),
         }

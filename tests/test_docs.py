@@ -14,7 +14,6 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl import orbits
-from lfm_ppl.accuracy import calibration
 from lfm_ppl.cli import main
 from lfm_ppl.io import loading
 
@@ -26,8 +25,8 @@ DATA = Path(os.environ.get("LFM_DATA", ROOT.parent / "shared" / "data"))
 
 def public():
     """Yield (name, function) of every public function, and of every public method of a public class."""
-    for module in (lfm, lfm.forces, orbits, calibration):
-        for name in getattr(module, "__all__", ("calibrate",)):
+    for module in (lfm, lfm.forces, lfm.priors, orbits):
+        for name in module.__all__:
             value = getattr(module, name)
             if inspect.isclass(value) and value.__module__.startswith("lfm_ppl"):
                 yield name, value.__init__
@@ -40,9 +39,9 @@ def public():
 def test_every_public_name_stands_in_the_reference_once():
     reference = [name for page in sorted((DOCS / "api").glob("*.md"))
                  for name in re.findall(r"^::: lfm_ppl\.(\S+)$", page.read_text("utf-8"), re.MULTILINE)]
-    of_modules = {f"{module}.{name}" for module in ("forces", "orbits") for name in getattr(lfm, module).__all__
-                  if name not in lfm.__all__}
-    missing = {*lfm.__all__, *of_modules} - {"data", "forces", "orbits"} - set(reference)
+    of_modules = {f"{module}.{name}" for module in ("forces", "orbits", "priors")
+                  for name in getattr(lfm, module).__all__ if name not in lfm.__all__}
+    missing = {*lfm.__all__, *of_modules} - {"data", "forces", "orbits", "priors"} - set(reference)
     assert not missing, f"add to a page of docs/api: {missing}"
     assert len(reference) == len(set(reference))
 

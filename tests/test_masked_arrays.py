@@ -42,7 +42,7 @@ USES = {
     "bind": lambda y: lfm.bind(numpyro_model, TIMES, y).log_density(jnp.zeros(1)),
     "potential of NumPyro": lambda y: numpyro.infer.util.log_density(numpyro_model, (TIMES, y), {}, {"rate": 0.3})[0],
     "particle_filter": lambda y: lfm.particle_filter(KEY, CUBIC, TIMES, y, particles=50, steps=2).log_likelihood,
-    "full_information": lambda y: lfm.full_information(MODEL, TIMES, y, lower={"f": -5.0}, grid=TIMES).force("f"),
+    "full_information": lambda y: lfm.full_information(MODEL, TIMES, y, lower={"f": -5.0}, grid=TIMES).force("f").mean,
     "Data": lambda y: lfm.Data(TIMES, y, ("x",)).y,
     "read_table": lambda y: lfm.read_table({"time": TIMES, "x": y[:, 0]}).y,
 }

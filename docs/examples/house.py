@@ -27,7 +27,7 @@ def model(times, y=None, inputs=None):
         return jnp.stack([d_air, into_walls * (air - walls) + out * (inputs["Ta"](t) - walls)])
 
     house = lfm.LatentForceModel(dynamics, {"heat": lfm.Matern(scale, lengthscale, order=0)},
-                                 lfm.GaussianObservation(lambda x, u, t: x[:1], noise_sd**2 * jnp.ones(1)),
+                                 lfm.GaussianObservation(lambda x, u, t: x[:1], sd=noise_sd),
                                  lfm.Gaussian(jnp.array([18.0, 17.0]), jnp.diag(jnp.array([1.0, 9.0]))))
     numpyro.sample("y", lfm.MarginalLikelihood(house, times), obs=y)
 

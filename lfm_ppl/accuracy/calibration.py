@@ -51,9 +51,9 @@ class Calibration:
     draws: int
 
 
-def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, data_sets: int = 200, draws: int = 63,
-              thin: int = 10, warmup: int = 500, batch: int | None = None, method: str | None = None,
-              folder: str | Path | None = None, overwrite: bool = False, report: Reporter | None = None,
+def calibrate(key: jax.Array, numpyro_model: Callable, times: Any, kernel: Callable, *, data_sets: int = 200,
+              draws: int = 63, thin: int = 10, warmup: int = 500, batch: int | None = None, method: str | None = None,
+              checkpoint: str | Path | None = None, overwrite: bool = False, report: Reporter | None = None,
               workers: Workers = 1) -> Calibration:
     """Rank true parameters among posterior draws, for many data sets that the model itself generates.
 
@@ -64,7 +64,7 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
 
     Args:
         key: a JAX random key.
-        model: NumPyro model ``model(times, y=None)`` with one likelihood site.
+        numpyro_model: NumPyro model ``model(times, y=None)`` with one likelihood site.
         times: (T,).
         kernel: maps a NumPyro model to an MCMC kernel, such as ``lfm.RAM`` or ``numpyro.infer.NUTS``.
         data_sets: number of replications.
@@ -76,7 +76,7 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
         method: "vectorized", the data sets of a task side by side, or "sequential", one after the other. Side by side
             all of them wait for whichever takes longest, at each step: for its tree with NUTS, and for its factors with
             an observation family or constraints. None: sequential for the latter, vectorized otherwise.
-        folder: storage of the ranks of each task, from which a stopped run resumes; None: no storage.
+        checkpoint: folder that stores the ranks of each task, from which a stopped run resumes; None: no folder.
         overwrite: compute again what was stored with other settings.
         report: what to do with a line of progress; None: nothing.
         workers: what computes; see `lfm_ppl.parallel.run.run_tasks`.
@@ -108,20 +108,22 @@ def calibrate(key: jax.Array, model: Callable, times: Any, kernel: Callable, *, 
     for name, value in (("data_sets", data_sets), ("draws", draws), ("thin", thin), ("warmup", warmup)):
         checks.positive_integer(name, value)
     if batch is None:
-        batch = data_sets if folder is None and isinstance(workers, int) and workers == 1 else min(_BATCH, data_sets)
+        is_inline = checkpoint is None and isinstance(workers, int) and workers == 1
+        batch = data_sets if is_inline else min(_BATCH, data_sets)
     checks.positive_integer("batch", batch)
     if method is not None:
         checks.one_of("method", method, METHODS)
-    compute = _Ranks(model, np.asarray(times, float), kernel, draws, thin, warmup, batch, method)
-    likelihood_site(model, (compute.times,), {}, jax.random.key(0))  # raises an error before anything is computed
+    compute = _Ranks(numpyro_model, np.asarray(times, float), kernel, draws, thin, warmup, batch, method)
+    # Raises an error before anything is computed.
+    likelihood_site(numpyro_model, (compute.times,), {}, jax.random.key(0))
     truth_keys, chain_keys = (np.asarray(jax.random.key_data(jax.random.split(subkey, data_sets)))
                               for subkey in jax.random.split(key))
     settings = {"key": np.asarray(jax.random.key_data(key)).ravel().tolist(), "times": compute.times.tolist(),
-                "model": _name(model), "kernel": _name(kernel), "draws": draws, "thin": thin, "warmup": warmup}
+                "model": _name(numpyro_model), "kernel": _name(kernel), "draws": draws, "thin": thin, "warmup": warmup}
     tasks = [Task(f"data-sets/{first:05d}-{min(first + batch, data_sets) - 1:05d}", 0, settings,
                   (truth_keys[first:first + batch], chain_keys[first:first + batch], str(jax.random.key_impl(key))))
              for first in range(0, data_sets, batch)]
-    outcomes = run_tasks(tasks, compute, folder, overwrite=overwrite, report=report, workers=workers)
+    outcomes = run_tasks(tasks, compute, checkpoint, overwrite=overwrite, report=report, workers=workers)
     parts = [outcomes[task.name] for task in tasks]
     return Calibration({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, draws)
 

@@ -89,7 +89,7 @@ def _draw_trajectories(view: ResultView, numpyro_model: Callable, times: Any, y:
                        seed: int) -> xr.Dataset:
     """Draw trajectories at some of the picked draws, in the layout of the result."""
     template = view.group("trajectories")
-    path_times = times_of(template, "at").values if {"at", TIMES} & set(template.coords) else None
+    path_times = times_of(template).values if {"time", TIMES} & set(template.coords) else None
     draw_index, rows = evenly_spaced(picked.shape[0], picked.shape[1], count)
     problem = rebuilding.problem(view, numpyro_model, times, y, model_kwargs).select(picked.ravel()[rows])
     paths = {label: values.reshape(picked.shape[0], len(draw_index), *values.shape[1:]) for label, values in

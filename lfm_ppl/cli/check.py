@@ -165,7 +165,7 @@ def _exact_chains(task: StoredFit, options: CheckOptions, folder: Path) -> Any:
         warmup = max(warmup, _WARMUP)
     trajectory_times = None
     if "trajectories" in task.view.groups:
-        trajectory_times = times_of(task.view.groups["trajectories"], "at").values
+        trajectory_times = times_of(task.view.groups["trajectories"]).values
     kind = ", delayed acceptance" if options.delayed else ""
     print(f"correct  particle-marginal RAM{kind}, {chains} chains of {warmup} warm-up and {samples} kept draws",
           flush=True)

@@ -69,7 +69,7 @@ def run(name: str, options: FitArguments, line: Sequence[str]) -> int:
             print(f"resume   no run to resume in {folder}: this is a new run")
         if options.inference.set:  # an unknown name must not be printed as fixed
             with calendar_time.in_messages(observed.origin, observed.units.get("time", "")):
-                bind(numpyro_model, observed.times, observed.y, **keywords).fix(fixed)
+                bind(numpyro_model, observed.times, observed.y, model_kwargs=keywords).fix(fixed)
         _print_data(options, model, observed, fixed)
         _print_settings(options, model_options, observed)
         resume = pages.command_line(line, *([] if output.out else ["--out", str(folder)]), "--resume")

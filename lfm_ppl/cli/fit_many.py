@@ -69,7 +69,7 @@ def run(model_name: str, options: FitArguments, line: Sequence[str]) -> int:
     path = Path(options.output.out or folders.FOLDER / f"{model.name}-many")
     with folders.open_folder(path) as folder, _pickled_by_value(model, workers):
         fits = lfm_ppl.fit_many(
-            approximated_model(options, model), data_sets, out=folder, workers=workers, each=arguments,
+            approximated_model(options, model), data_sets, checkpoint=folder, workers=workers, each=arguments,
             progress=not options.output.quiet, **sampling_arguments(options, model))
         fits.refused = failed
         print(f"model    {model.name}: {model.summary}" if model.summary else f"model    {model.name}")

@@ -66,7 +66,7 @@ def _bind(model: loading.ModelFile) -> Any:
         shape = (2, 3) if labels else (3,)
         data = Data(np.broadcast_to(times, shape), np.zeros((*shape, len(outputs))), outputs, units=model.units,
                     inputs=inputs, series=labels)
-    return bind(model.model, data.times, data.y, **model.keywords(data, {}))
+    return bind(model.model, data.times, data.y, model_kwargs=model.keywords(data, {}))
 
 
 def _print_sites(model: loading.ModelFile, bound: Any) -> None:

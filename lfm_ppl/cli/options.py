@@ -232,23 +232,25 @@ class Inference:
                 raise ValueError(f"{flag} is for {', '.join(samplers)}, not for the sampler {self.sampler}.")
 
 
-@_options_of("approximation (default: the model's)")
+@_options_of("approximation (default: the model's, else as below)")
 @dataclass(frozen=True)
 class Approximation:
     """Settings of the likelihood; None: the model's."""
 
     rule: Annotated[str, Parameter(choices=tuple(RULES), metavar="RULE")] | None = None
-    """linearisation rule"""
+    """linearisation rule (default: cubature)"""
     steps: Count | None = None
-    """integration steps between observations"""
+    """integration steps between observations (default: 10)"""
     max_step: Annotated[Positive, Parameter(metavar="TIME")] | None = None
-    """longest integration step"""
+    """longest integration step (default: twice the median step)"""
     tolerance: Annotated[Positive, Parameter(metavar="SD")] | None = None
-    """adaptive steps: largest error of an integration step, in standard deviations; excludes --iterations"""
+    """adaptive steps: largest error of an integration step, in standard deviations; excludes --iterations (default:
+    equal steps)"""
     method: Annotated[str, Parameter(metavar="METHOD", validator=_check_method)] | None = None
-    """method of integration: runge-kutta, or exponential for stiff dynamics"""
+    """method of integration: runge-kutta, or exponential for stiff dynamics (default: runge-kutta)"""
     iterations: CountOrZero | None = None
-    """iterations of posterior linearisation; 0: a single pass"""
+    """iterations of posterior linearisation; 0: a single pass (default: 3; 0 for linear models, observation families
+    and --tolerance)"""
     lower: Pairs = ()
     """lower bound of a state, force or output, such as "transcription factor=0"; may be repeated; each likelihood then
     costs some hundred times as much"""

@@ -9,9 +9,7 @@ import platform
 import warnings
 from pathlib import Path
 
-from lfm_ppl.utils.compilation import ONE_THREAD, fast_loops
-
-_MOST_DEVICES = 64
+from lfm_ppl.utils.compilation import MOST_DEVICES, ONE_THREAD, fast_loops
 
 SWITCH = "LFM_PPL_CACHE"
 """Environment variable that switches the cache of compiled programs off with the value "off"."""
@@ -41,7 +39,7 @@ def start(chains: int, keep_programs: bool = True, one_thread: bool = False) -> 
 
     jax.config.update("jax_enable_x64", True)
     fast_loops()
-    numpyro.set_host_device_count(min(chains, _MOST_DEVICES))
+    numpyro.set_host_device_count(min(chains, MOST_DEVICES))
     if keep_programs and not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
         folder = cache_folder()
         if folder is not None and _is_ready(folder):

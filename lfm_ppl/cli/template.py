@@ -51,7 +51,7 @@ def build(loss, scale, lengthscale, noise_sd):
         forces={"heat": lfm.Matern(scale=scale, lengthscale=lengthscale, order=1)},
         # What is measured of (x, u), and the variance of the noise of each output (a function of x, u, t where it
         # differs: lambda x, u, t: (0.1 * x) ** 2 for an error of 10%).
-        observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
+        observation=lfm.GaussianObservation(lambda x, u, t: x, sd=noise_sd),
         # What is known of the state at the first time: mean (M,) and covariance (M, M).
         initial_state=lfm.Gaussian(jnp.array([15.0]), 25.0 * jnp.eye(1)),
         state_names=("x",),

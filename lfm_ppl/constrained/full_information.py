@@ -17,6 +17,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -26,6 +27,7 @@ from lfm_ppl.constrained.gauss_newton import solve_nonlinear
 from lfm_ppl.constrained.interior_point import RESPECTED, ConstrainedProblem, Solution, solve_linear
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.moments import Moments
+from lfm_ppl.filtering.smoother import MeanSd
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
@@ -36,7 +38,7 @@ from lfm_ppl.utils.programs import shared_jit
 
 
 class ConstrainedEstimate(eqx.Module):
-    """Result of `full_information` and `lfm_ppl.moving_horizon`.
+    """Result of `full_information` and `lfm_ppl.MovingHorizon.estimate`.
 
     Attributes:
         times: (K,), times at which the constraints hold.
@@ -77,19 +79,21 @@ class ConstrainedEstimate(eqx.Module):
         """Whether a constraint is active, (K, C): its multiplier exceeds its slack, both in standard deviations."""
         return self.multiplier * self.scale > self.slack / self.scale
 
-    def state(self, name: str) -> jax.Array:
-        """Return the trajectory (K,) of a physical state.
+    def state(self, name: str) -> MeanSd:
+        """Return the trajectory (K,) of a physical state as ``mean``; its ``sd`` is NaN.
 
         Raises:
             ValueError: an unknown name; the message lists similar names.
         """
         checks.one_of("state", name, self.state_names)
-        return self.state_mean[:, self.state_names.index(name)]
+        mean = self.state_mean[:, self.state_names.index(name)]
+        return MeanSd(mean, jnp.full_like(mean, jnp.nan))
 
-    def force(self, name: str) -> jax.Array:
-        """Return the trajectory (K,) of a force."""
+    def force(self, name: str) -> MeanSd:
+        """Return the trajectory (K,) of a force as ``mean``; its ``sd`` is NaN."""
         checks.one_of("force", name, self.force_names)
-        return self.force_mean[:, self.force_names.index(name)]
+        mean = self.force_mean[:, self.force_names.index(name)]
+        return MeanSd(mean, jnp.full_like(mean, jnp.nan))
 
 
 def full_information(model: LatentForceModel, times: ArrayLike, y: ArrayLike,
@@ -145,7 +149,7 @@ def full_information(model: LatentForceModel, times: ArrayLike, y: ArrayLike,
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
         ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> estimate = lfm.full_information(model, np.arange(3.0), -jnp.ones((3, 1)), lower={"u": 0.0})
-        >>> bool(estimate.force("u").min() >= 0), bool(estimate.converged)
+        >>> bool(estimate.force("u").mean.min() >= 0), bool(estimate.converged)
         (True, True)
 
     Source: Wolff, Lopez, Müller and Beckers, Inference in latent force models using optimal state estimation, section

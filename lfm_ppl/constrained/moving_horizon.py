@@ -7,8 +7,8 @@
 3. The MAP problem of the window, with the arrival moments as its prior, is solved by an interior point
    (`_solve_window`).
 4. The estimate is the state ``delay`` observations before the last one.
-5. `MovingHorizon.update` does this for one observation. `moving_horizon` starts with the first full window and scans
-   over the other observations of a record.
+5. `MovingHorizon.update` does this for one observation. `MovingHorizon.estimate` starts with the first full window and
+   scans over the other observations of a record.
 
 Source: Wolff, Lopez, Müller and Beckers, section 3.3; Rawlings, Mayne and Diehl (2017), Model predictive control,
 chapter 4.
@@ -118,7 +118,7 @@ class HorizonSettings(eqx.Module):
 
 
 class MovingHorizon(eqx.Module):
-    r"""A moving horizon estimator, which processes one observation at a time.
+    r"""A moving horizon estimator, for a record (`estimate`) or one observation at a time (`start`, `update`).
 
     For each observation it finds the most probable trajectory over the last W observations,
 
@@ -130,7 +130,7 @@ class MovingHorizon(eqx.Module):
     constraint is active, the estimates for a linear model equal the Kalman filter (delay 0) or the fixed-lag smoother.
 
     Args:
-        model: the latent force model, with an ``initial_time``; its functions are read once, as by `jax.jit`.
+        model: the latent force model; its functions are read once, as by `jax.jit`.
         window: number of observations W in the window.
         delay: number of observations after the one that is estimated, less than W; W // 2 by default.
         lower: lower bounds by name, as in `lfm_ppl.full_information`.
@@ -145,19 +145,24 @@ class MovingHorizon(eqx.Module):
             `lfm_ppl.full_information` for the model and the constraints.
 
     Example:
-        >>> import jax.numpy as jnp, lfm_ppl as lfm
+        >>> import jax.numpy as jnp, numpy as np, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
         ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
         ...     initial_time=0.0)
         >>> horizon = lfm.MovingHorizon(model, window=3, delay=0, lower={"u": 0.0})
+        >>> bool(horizon.estimate(np.arange(6.0), -jnp.ones((6, 1))).force("u").mean.min() >= 0)
+        True
+
+        The same for one observation after the other:
+
         >>> state, estimate = horizon.update(horizon.start(), 0.5, [-1.0])
         >>> state, estimate = horizon.update(state, 1.0, [-1.0])
         >>> float(estimate.time), bool(estimate.force_mean[0] >= 0)
         (1.0, True)
 
-    Source: Wolff, Lopez, Müller and Beckers, section 3.3; Rawlings, Mayne and Diehl (2017), Model predictive control,
-    chapter 4.
+    Source: Wolff, Lopez, Müller and Beckers, section 3.3 and equations 13 to 17; Rawlings, Mayne and Diehl (2017),
+    Model predictive control, chapter 4.
     """
 
     settings: HorizonSettings
@@ -166,15 +171,60 @@ class MovingHorizon(eqx.Module):
                  lower: Mapping[str, ArrayLike] | None = None, upper: Mapping[str, ArrayLike] | None = None,
                  constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), steps: int = 10,
                  tolerance: float = 1e-10, max_passes: int = 100):
-        if model.initial_time is None:
-            raise ValueError("a moving horizon estimator needs a model with an initial_time, the time of its initial "
-                             "state; pass initial_time to lfm.LatentForceModel.")
         check_settings(model, tolerance, max_passes)
         self.settings = _build_settings(model, build_constraints(model, lower, upper, constraints), window, delay,
                                         steps, tolerance, max_passes)
 
+    def estimate(self, times: ArrayLike, y: ArrayLike) -> ConstrainedEstimate:
+        """Run the estimator over a record.
+
+        Row k is estimated from the window that ends ``delay`` observations later; the first rows come from the first
+        full window, and the last rows from the last window. A window as long as the record is equivalent to
+        `lfm_ppl.full_information` with ``grid=times``.
+
+        Args:
+            times: (T,), non-decreasing, at least as many as the window holds.
+            y: (T, D), NaN where missing.
+
+        Returns:
+            Trajectories at ``times``. Gap and passes are the largest of all windows; ``converged`` is whether all
+            windows have converged; the objective is that of the last window.
+
+        Raises:
+            ValueError, TypeError: a window longer than the record, traced times, and as `lfm_ppl.full_information`.
+
+        Warns:
+            UserWarning: not all windows have converged.
+        """
+        settings, model = self.settings, self.settings.filter_ssm.model
+        row_times = check_times(times, model.initial_time)
+        if row_times is None:
+            raise ValueError("times must be known before compilation; pass a NumPy array.")
+        if settings.window > len(row_times):
+            raise ValueError(f"the window holds {settings.window} observations, but there are {len(row_times)}. Take a "
+                             "window of at most their number (of exactly it: lfm.full_information).")
+        initial_time = row_times[0] if model.initial_time is None else model.initial_time
+        model.check_at(initial_time, len(row_times))
+        y = check_observations(y, len(row_times), len(model.output_names))
+        if not checks.traced(initial_time):
+            _warn_of_breakpoints(model, row_times, float(initial_time))
+        result = _estimate_record(settings, jnp.asarray(row_times), y, jnp.asarray(initial_time, float))
+        if not checks.traced(result) and not bool(result.converged):
+            checks.warn("some windows of the moving horizon estimate have not converged: the largest duality gap is "
+                        f"{float(result.gap):.2g}, the largest violation of a constraint "
+                        f"{float(np.max(result.violation)):.2g} standard deviations. Raise max_passes, or loosen a "
+                        "constraint that no trajectory respects.")
+        return result
+
     def start(self) -> HorizonState:
-        """Return the state before the first observation."""
+        """Return the state before the first observation.
+
+        Raises:
+            ValueError: the model has no ``initial_time``, the time of its initial state.
+        """
+        if self.settings.filter_ssm.model.initial_time is None:
+            raise ValueError("an estimator that processes one observation at a time needs a model with an "
+                             "initial_time, the time of its initial state; pass initial_time to lfm.LatentForceModel.")
         window, ssm = self.settings.window, self.settings.filter_ssm
         initial_time = jnp.asarray(ssm.model.initial_time, float)
         # The types are those after an update, so that one program serves all: a Python number would be weakly typed.
@@ -206,74 +256,6 @@ class MovingHorizon(eqx.Module):
         if time is not None and last_time is not None and not time >= last_time:
             raise ValueError(f"t = {float(time):g} lies before {float(last_time):g}, the time of the last observation.")
         return _update(self.settings, state, jnp.asarray(t, float), jnp.asarray(y, float))
-
-
-def moving_horizon(model: LatentForceModel, times: ArrayLike, y: ArrayLike, window: int, delay: int | None = None,
-                   lower: Mapping[str, ArrayLike] | None = None, upper: Mapping[str, ArrayLike] | None = None,
-                   constraints: Callable[..., Any] | Sequence[Callable[..., Any]] = (), steps: int = 10,
-                   tolerance: float = 1e-10, max_passes: int = 100) -> ConstrainedEstimate:
-    """Run a moving horizon estimator over a record.
-
-    Row k is estimated from the window that ends ``delay`` observations later; the first rows come from the first full
-    window, and the last rows from the last window. `lfm_ppl.MovingHorizon` does the same one observation at a time. A
-    window as long as the record is equivalent to `lfm_ppl.full_information` with ``grid=times``.
-
-    Args:
-        model: the latent force model; its functions are read once for each model, as by `jax.jit`.
-        times: (T,), non-decreasing.
-        y: (T, D), NaN where missing.
-        window: number of observations W in the window, from 2 to T.
-        delay: number of observations after the one that is estimated, less than W; W // 2 by default.
-        lower: lower bounds by name, as in `lfm_ppl.full_information`; they hold at ``times``.
-        upper: upper bounds by name.
-        constraints: functions c(x, u, t), as in `lfm_ppl.full_information`.
-        steps: integration steps between two observations; without effect for a linear model.
-        tolerance: tolerance of the duality gap, in units of the log density.
-        max_passes: largest number of smoother passes for a window.
-
-    Returns:
-        Trajectories at ``times``. Gap and passes are the largest of all windows; ``converged`` is whether all windows
-        have converged; the objective is that of the last window.
-
-    Raises:
-        ValueError, TypeError: a window longer than the record or shorter than two observations, a delay outside of the
-            window, and as `lfm_ppl.full_information`.
-
-    Warns:
-        UserWarning: not all windows have converged.
-
-    Example:
-        >>> import jax.numpy as jnp, numpy as np, lfm_ppl as lfm
-        >>> model = lfm.LatentForceModel(
-        ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
-        >>> y = -jnp.ones((6, 1))
-        >>> bool(lfm.moving_horizon(model, np.arange(6.0), y, window=4, lower={"u": 0.0}).force("u").min() >= 0)
-        True
-
-    Source: Wolff, Lopez, Müller and Beckers, equations 13 to 17.
-    """
-    row_times = check_times(times, model.initial_time)
-    if row_times is None:
-        raise ValueError("times must be known before compilation; pass a NumPy array.")
-    check_settings(model, tolerance, max_passes)
-    settings = _build_settings(model, build_constraints(model, lower, upper, constraints), window, delay, steps,
-                               tolerance, max_passes)
-    if window > len(row_times):
-        raise ValueError(f"the window holds {window} observations, but there are {len(row_times)}. Take a window of at "
-                         "most their number (of exactly it: lfm.full_information).")
-    initial_time = row_times[0] if model.initial_time is None else model.initial_time
-    model.check_at(initial_time, len(row_times))
-    y = check_observations(y, len(row_times), len(model.output_names))
-    if not checks.traced(initial_time):
-        _warn_of_breakpoints(model, row_times, float(initial_time))
-    result = _estimate_record(settings, jnp.asarray(row_times), y, jnp.asarray(initial_time, float))
-    if not checks.traced(result) and not bool(result.converged):
-        checks.warn("some windows of the moving horizon estimate have not converged: the largest duality gap is "
-                    f"{float(result.gap):.2g}, the largest violation of a constraint "
-                    f"{float(np.max(result.violation)):.2g} standard deviations. Raise max_passes, or loosen a "
-                    "constraint that no trajectory respects.")
-    return result
 
 
 def _build_settings(model: LatentForceModel, constraints: Constraints, window: int, delay: int | None, steps: int,

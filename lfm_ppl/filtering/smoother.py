@@ -47,7 +47,11 @@ from lfm_ppl.utils.programs import shared_jit
 
 
 class MeanSd(NamedTuple):
-    """Mean (K,) and standard deviation (K,) of one force or state at the requested times."""
+    """Mean (K,) and standard deviation (K,) of one force or state at the times of a result.
+
+    Every result returns it from ``force(name)`` and ``state(name)``. The standard deviation is NaN where a result has
+    none, as a most probable trajectory, which is then the mean.
+    """
 
     mean: jax.Array
     sd: jax.Array

@@ -200,7 +200,8 @@ def log_likelihood(ssm: StateSpaceModel, time_grid: TimeGrid, y: jax.Array, grid
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> from lfm_ppl.filtering.time_grid import build_time_grid
-        >>> ssm = lfm.state_space(lfm.LatentForceModel(
+        >>> from lfm_ppl.model.state_space import state_space
+        >>> ssm = state_space(lfm.LatentForceModel(
         ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
         ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1)))
         >>> time_grid = build_time_grid(ssm, [0.0, 1.0, 2.0], 1)

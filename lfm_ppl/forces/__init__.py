@@ -3,6 +3,7 @@
 The public names are exported here as `lfm_ppl.forces.NAME`; the most common ones are also `lfm_ppl.NAME`.
 """
 
+from lfm_ppl.forces import priors as priors
 from lfm_ppl.forces.constant import Constant
 from lfm_ppl.forces.matern import Matern
 from lfm_ppl.forces.periodic_kernels import (
@@ -12,10 +13,10 @@ from lfm_ppl.forces.periodic_kernels import (
     PeriodicMatern,
     PeriodicSquaredExponential,
 )
-from lfm_ppl.forces.quasi_periodic import Periodic, QuasiPeriodic, significant_functions
+from lfm_ppl.forces.quasi_periodic import Periodic, QuasiPeriodic
 from lfm_ppl.forces.random_walk import RandomWalk
 from lfm_ppl.forces.resonator import Resonator
-from lfm_ppl.forces.sde import ApproximationWarning, Force, Stack, Sum
+from lfm_ppl.forces.sde import ApproximationWarning, Force, Sum
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.forces.weights import CQM, SQM, WQM, change_points
 from lfm_ppl.forces.wiener_velocity import WienerVelocity
@@ -37,10 +38,8 @@ __all__ = [
     "Resonator",
     "SQM",
     "SquaredExponential",
-    "Stack",
     "Sum",
     "WQM",
     "WienerVelocity",
     "change_points",
-    "significant_functions",
 ]

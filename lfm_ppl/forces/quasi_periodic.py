@@ -292,7 +292,7 @@ def significant_functions(kernel: PeriodicCovariance, gamma: float = 0.01, point
         raise ValueError(f"gamma must be below 1, got {gamma:g}. It is a share of the largest eigenvalue.")
     if checks.traced(kernel):
         raise ValueError("the number of functions sets the number of states, so it cannot depend on traced parameters. "
-                         "Pass functions=J; lfm.forces.significant_functions(kernel) returns J for typical values. "
+                         "Pass functions=J; lfm.Periodic(kernel).functions is J for typical values. "
                          "(Inside compiled code, such as a NumPyro model, all numbers are traced.)")
     if not kernel.stationary:
         values = spectrum(kernel, points)

@@ -16,11 +16,11 @@ from lfm_ppl.forces.sde import Force
 class WienerVelocity(Force):
     """Integrated Brownian motion, ``d(du/dt) = scale dbeta``: a smooth force without a lengthscale.
 
-    The state is ``(u, u')``. With independent ``u(t0) ~ N(0, initial_value_sd^2)`` and
+    The state is ``(u, u')``. With independent ``u(t0) ~ N(0, initial_sd^2)`` and
     ``u'(t0) ~ N(0, initial_velocity_sd^2)``, and with times t >= s counted from the model's
     initial time t0,
 
-        cov(u(t), u(s)) = initial_value_sd^2 + initial_velocity_sd^2 t s
+        cov(u(t), u(s)) = initial_sd^2 + initial_velocity_sd^2 t s
                           + scale^2 (s^3 / 3 + s^2 (t - s) / 2).
 
     It is not stationary: its variance grows with time, and it has no spectral density. Without
@@ -28,7 +28,7 @@ class WienerVelocity(Force):
 
     Args:
         scale: square root of the rate at which the variance of the velocity grows, in force units / time^(3/2); > 0.
-        initial_value_sd: standard deviation of u at the initial time; >= 0.
+        initial_sd: standard deviation of u at the initial time; >= 0.
         initial_velocity_sd: standard deviation of u' at the initial time, in force units / time; >= 0.
         mean: a number, or a function of time.
 
@@ -36,13 +36,13 @@ class WienerVelocity(Force):
         ValueError: the scale is not positive, or an initial standard deviation is negative.
 
     Example:
-        >>> force = WienerVelocity(scale=1.0, initial_value_sd=2.0)
+        >>> force = WienerVelocity(scale=1.0, initial_sd=2.0)
         >>> round(float(force.covariance(3.0, 3.0)), 6)
         13.0
     """
 
     scale: jax.Array
-    initial_value_sd: jax.Array
+    initial_sd: jax.Array
     initial_velocity_sd: jax.Array
     mean: Any
 
@@ -51,18 +51,18 @@ class WienerVelocity(Force):
     def __init__(
         self,
         scale: ArrayLike,
-        initial_value_sd: ArrayLike = 0.0,
+        initial_sd: ArrayLike = 0.0,
         initial_velocity_sd: ArrayLike = 0.0,
         mean: Mean = 0.0,
     ):
         self.scale = positive_parameter("scale", scale)
-        self.initial_value_sd = non_negative_parameter("initial_value_sd", initial_value_sd)
+        self.initial_sd = non_negative_parameter("initial_sd", initial_sd)
         self.initial_velocity_sd = non_negative_parameter("initial_velocity_sd", initial_velocity_sd)
         self.mean = mean_parameter(mean)
 
     def initial_covariance(self) -> jax.Array:
         """Return the covariance (2, 2) at the model's initial time."""
-        return jnp.diag(jnp.stack([self.initial_value_sd, self.initial_velocity_sd]) ** 2)
+        return jnp.diag(jnp.stack([self.initial_sd, self.initial_velocity_sd]) ** 2)
 
     def feedback(self) -> jax.Array:
         """Return F (2, 2), nilpotent."""
@@ -83,7 +83,7 @@ class WienerVelocity(Force):
         """Return the covariance of u(t) and u(s), with times counted from the initial time."""
         late, early = jnp.maximum(t, s), jnp.minimum(t, s)
         integrated_noise = early**3 / 3.0 + early**2 * (late - early) / 2.0
-        initial = self.initial_value_sd**2 + self.initial_velocity_sd**2 * late * early
+        initial = self.initial_sd**2 + self.initial_velocity_sd**2 * late * early
         return initial + self.scale**2 * integrated_noise
 
     def spectral_density(self, omega: ArrayLike) -> jax.Array:

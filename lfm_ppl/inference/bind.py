@@ -15,17 +15,18 @@ from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.utils import checks
 
 
-def bind(model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y: ArrayLike | Mapping[str, ArrayLike],
-         **keywords: Any) -> BoundModel:
+def bind(numpyro_model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y: ArrayLike | Mapping[str, ArrayLike],
+         *, model_kwargs: Mapping[str, Any] | None = None) -> BoundModel:
     """Bind a NumPyro model to its times and data: its log posterior as a plain function, for any sampler.
 
     Args:
-        model: ``model(times, y=None, **keywords)`` with one site ``numpyro.sample(name, lfm.MarginalLikelihood(...),
-            obs=y)``, or a `lfm_ppl.panel` in a plate; or with several such sites, see below.
+        numpyro_model: ``model(times, y=None, **model_kwargs)`` with one site
+            ``numpyro.sample(name, lfm.MarginalLikelihood(...), obs=y)``, or a `lfm_ppl.panel` in a plate; or with
+            several such sites, see below.
         times: (T,), or (B, T) for a panel; of several sites a dict of these by name of the site.
         y: (T, D), or (B, T, D) for a panel; NaN where missing. A tracer within compiled code. A dict like ``times``.
-        **keywords: further arguments of the model. Arrays of real numbers, such as known inputs, doses and covariances
-            of rows, are arguments of the compiled functions; other values decide what is compiled.
+        model_kwargs: keyword arguments of the model. Arrays of real numbers, such as known inputs, doses and
+            covariances of rows, are arguments of the compiled functions; other values decide what is compiled.
 
     Returns:
         The bound model, with ``log_density``, ``log_density_gradient``, ``constrain``, ``unconstrain``, ``names``,
@@ -98,8 +99,9 @@ def bind(model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y: ArrayLi
         >>> bool(jnp.abs(bound.log_density_gradient(z)[1]).max() < 0.1)
         True
     """
-    if not callable(model):
-        raise TypeError(f"model must be a NumPyro model, a function of times and y, got {type(model).__name__}.")
+    if not callable(numpyro_model):
+        raise TypeError("numpyro_model must be a NumPyro model, a function of times and y, got "
+                        f"{type(numpyro_model).__name__}.")
     if checks.traced(times):
         raise TypeError("times decide what is compiled, so they must be numbers, but they are traced; bind the model "
                         "outside of jit, and pass only y into it.")
@@ -109,7 +111,7 @@ def bind(model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y: ArrayLi
     times, values = _arrays_by_site(times, y) if is_by_site else _arrays(times, y)
     columns = jax.tree.map(lambda y, times: y[:, None] if y.ndim == times.ndim == 1 else y, values, times)
     try:
-        bound = bind_arguments(model, (times, columns), keywords)
+        bound = bind_arguments(numpyro_model, (times, columns), model_kwargs or {})
     except (IndexError, KeyError) as error:
         # A dict without a site that the model reads, or an array in the place of a dict.
         is_missing = is_by_site and isinstance(error, KeyError) and error.args[0] not in values

@@ -109,7 +109,7 @@ class MAPResult:
 
 
 def map_estimate(
-    model: Callable,
+    numpyro_model: Callable,
     *args: Any,
     init: Callable | Mapping[str, Any] | None = None,
     restarts: int = 4,
@@ -132,7 +132,7 @@ def map_estimate(
     function. L-BFGS searches from several starts, and Newton's method polishes the best end point.
 
     Args:
-        model: a NumPyro model whose latent sites are continuous.
+        numpyro_model: a NumPyro model whose latent sites are continuous.
         *args: its positional arguments, data included.
         init: the first start: a NumPyro strategy, or site name -> constrained value (the prior median for other
             sites); by default ``init_to_median``. The other starts are prior draws.
@@ -181,7 +181,7 @@ def map_estimate(
             "numpyro.enable_x64() before anything else.",
             stacklevel=2,
         )
-    bound = bind_arguments(model, args, model_kwargs or {}, "map_estimate")
+    bound = bind_arguments(numpyro_model, args, model_kwargs or {}, "map_estimate")
     exact = not bound.has_likelihood if hessian is None else hessian == "autodiff"
     return mode_of(jax.random.key(seed), bound, init=init, restarts=restarts, jacobian=jacobian,
                    exact_hessian=exact, forward_mode=forward_mode, max_iterations=max_iterations)

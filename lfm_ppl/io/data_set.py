@@ -142,7 +142,7 @@ def stack_series(series: Mapping[str, Data]) -> Data:
     entries of ``parameters`` of the panel.
 
     Args:
-        series: label -> observations, as of `lfm_ppl.data.read_series`.
+        series: label -> observations, as of `lfm_ppl.read_series`.
 
     Raises:
         ValueError: a series has other outputs or known inputs than the first one; not all times are dates.

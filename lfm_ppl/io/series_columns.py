@@ -55,7 +55,7 @@ def check_order(table: Table, time_name: str, times: np.ndarray, free: Sequence[
         otherwise = "" if rows.size else (" If it names outputs, give each of them a column; else leave the column "
                                           "out of the file or table.")
         raise ValueError(f"{table.label}, row {table.frame.index[row]}: {change}. If "
-                         f"it names several series, fit them separately: --series {series} (lfm.data.read_series("
+                         f"it names several series, fit them separately: --series {series} (lfm.read_series("
                          f"path, {series!r}), or lfm.read_table of each part of a DataFrame).{otherwise}")
     if rows.size:
         row = rows[0] + 1

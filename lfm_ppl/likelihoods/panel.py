@@ -209,7 +209,7 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.
 
     The plate's name is the dimension of the series in the result of `lfm_ppl.fit`; `lfm_ppl.select_series` returns one
-    of them, and `lfm_ppl.data.stack_series` pads series of a file.
+    of them, and `lfm_ppl.stack_series` pads series of a file.
 
     Args:
         build: maps the parameters of ONE series to its `LatentForceModel`; it may close over shared parameters.

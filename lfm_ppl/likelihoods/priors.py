@@ -197,7 +197,8 @@ def _observation(observation: Any, names: tuple[str, ...]) -> list[str]:
             descriptions += _observation(part, names[first:first + size])
             first += size
         return descriptions
-    kind = type(observation).__name__.strip("_").removesuffix("Observation").removesuffix("Family") or "own law"
+    kind = type(observation).__name__.strip("_").removesuffix("Observation").removesuffix("Family")
+    kind = "own law" if kind in ("", "Distribution") else kind
     covariance = getattr(observation, "covariance", None)
     if callable(covariance):
         return [f"{name}: {kind} (sd a function of the state)" for name in names]

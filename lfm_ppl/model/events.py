@@ -74,6 +74,11 @@ class Event(eqx.Module):
         self.observation_first, self.is_reset = bool(observation_first), is_reset
 
     @property
+    def target(self) -> Any:
+        """Name of the state that changes, or the direction (M,) of a dose; None: all states."""
+        return self.state if self.direction is None else self.direction
+
+    @property
     def event_times(self) -> Any:
         """Times (K,), lag included; a NumPy array where neither is traced."""
         return self.times + self.lag
@@ -140,6 +145,11 @@ class Dose(Event):
                  observation_first: bool = True):
         _check_target_given(target)
         super().__init__(times, amounts, target, lag, observation_first, False)
+
+    @property
+    def amounts(self) -> Any:
+        """Amounts (K,), or one for all."""
+        return self.values
 
 
 class Infusion(Event):
@@ -208,6 +218,11 @@ class Infusion(Event):
             self.durations = jnp.where(is_positive, quotient, jnp.nan) if checks.traced(value) else quotient
 
     @property
+    def amounts(self) -> Any:
+        """Amounts (K,), or one for all."""
+        return self.values
+
+    @property
     def event_times(self) -> Any:
         """Starts (K,); NaN unless the duration is positive, and beyond all times where nothing is infused."""
         start = super().event_times
@@ -256,7 +271,7 @@ class Reset(Event):
 
     Args:
         times: (K,), in any order; not before the initial time of the model.
-        state: name of the state; None: all states.
+        target: name of the state; None: all states.
         values: v_k (K,), or one number for all; they may be parameters.
         lag: delay, as in `Dose`.
         observation_first: whether an observation at the time of a reset is taken before the reset.
@@ -279,11 +294,11 @@ class Reset(Event):
     label: ClassVar[str] = "a reset"
     argument: ClassVar[str] = "values"
 
-    def __init__(self, times: ArrayLike, state: str | None = None, values: ArrayLike = 0.0, lag: ArrayLike = 0.0,
+    def __init__(self, times: ArrayLike, target: str | None = None, values: ArrayLike = 0.0, lag: ArrayLike = 0.0,
                  observation_first: bool = True):
-        if state is not None and not isinstance(state, str):
-            raise TypeError(f"state of a reset must be the name of a state, got {type(state).__name__}.")
-        super().__init__(times, values, state, lag, observation_first, True)
+        if target is not None and not isinstance(target, str):
+            raise TypeError(f"target of a reset must be the name of a state, got {type(target).__name__}.")
+        super().__init__(times, values, target, lag, observation_first, True)
 
 
 class StateMap(NamedTuple):

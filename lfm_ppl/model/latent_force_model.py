@@ -118,10 +118,8 @@ class LatentForceModel(eqx.Module):
         _check_types(dynamics, observation, initial_state)
         self.force_names, self.forces = _forces_by_name(forces)
         self.dynamics, self.initial_state = own_functions(dynamics), initial_state
-        if isinstance(observation, ObservationFamily):
-            observation = observation.with_output_sizes(
-                lambda function: self._trace_observation(function).shape.shape[0])
-        self.observation = own_functions(observation)
+        self.observation = own_functions(observation.with_output_sizes(
+            lambda function: self._trace_observation(function).shape.shape[0]))
         if initial_time is not None:
             checks.finite("initial_time", initial_time)
         # A concrete time stays a NumPy array: inside jit jnp.asarray returns a tracer, but time grids need the number.
@@ -354,7 +352,7 @@ def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
     if not isinstance(observation, (GaussianObservation, ObservationFamily)):
         raise TypeError("observation must be an lfm.GaussianObservation, or a family such as lfm.PoissonObservation, "
                         f"got {type(observation).__name__}. Wrap the function: "
-                        "lfm.GaussianObservation(lambda x, u, t: x, variances).")
+                        "lfm.GaussianObservation(lambda x, u, t: x, sd=0.1).")
     if not isinstance(initial_state, Gaussian):
         raise TypeError(f"initial_state must be an lfm.Gaussian, got {type(initial_state).__name__}.")
 

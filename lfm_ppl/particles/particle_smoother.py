@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from lfm_ppl.filtering.integrators.exact import exact_offset
 from lfm_ppl.filtering.intervals import Intervals, TimeGrid, as_arrays
+from lfm_ppl.filtering.smoother import MeanSd, Trajectories
 from lfm_ppl.filtering.transition import exact
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.state_space import StateSpaceModel, state_space
@@ -46,19 +47,6 @@ _LARGEST_HISTORY = 2**32
 
 _BLOCK = 4_000_000
 """Number of transition densities that are computed at a time."""
-
-
-class SampledTrajectories(eqx.Module):
-    """Trajectories of one force or state.
-
-    Attributes:
-        draws: (S, K).
-        mean, sd: (K,), moments of the draws.
-    """
-
-    draws: jax.Array
-    mean: jax.Array
-    sd: jax.Array
 
 
 class ParticleSmootherResult(eqx.Module):
@@ -91,28 +79,39 @@ class ParticleSmootherResult(eqx.Module):
         centred = self.draws - self.mean
         return jnp.einsum("ski,skj->kij", centred, centred) / (self.draws.shape[0] - 1)
 
-    def force(self, name: str) -> SampledTrajectories:
-        """Return the trajectories of a force.
+    @property
+    def trajectories(self) -> Trajectories:
+        """The draws as trajectories of physical state (S, K, M) and forces (S, K)."""
+        inputs, size = self._inputs(slice(None)), self.ssm.physical_dim
+        forces = {name: inputs[:, :, size + index] for index, name in enumerate(self.ssm.model.force_names)}
+        return Trajectories(self.times, inputs[:, :, :size], forces)
+
+    def force(self, name: str) -> MeanSd:
+        """Return mean (K,) and sd (K,) of the draws of a force.
 
         Raises:
             ValueError: there is no force of that name.
         """
         checks.one_of("force", name, self.ssm.model.force_names)
-        return self._paths(self.ssm.physical_dim + self.ssm.model.force_names.index(name))
+        return self._moments(self.ssm.physical_dim + self.ssm.model.force_names.index(name))
 
-    def state(self, name: str) -> SampledTrajectories:
-        """Return the trajectories of a physical state.
+    def state(self, name: str) -> MeanSd:
+        """Return mean (K,) and sd (K,) of the draws of a physical state.
 
         Raises:
             ValueError: there is no state of that name.
         """
         checks.one_of("state", name, self.ssm.model.state_names)
-        return self._paths(self.ssm.model.state_names.index(name))
+        return self._moments(self.ssm.model.state_names.index(name))
 
-    def _paths(self, index: int) -> SampledTrajectories:
+    def _inputs(self, columns: slice) -> jax.Array:
+        """Return the draws (S, K, C) of some columns of the inputs w = (x, u)."""
         matrix, offset = jax.vmap(self.ssm.input_map)(self.times)
-        draws = jnp.einsum("kn,skn->sk", matrix[:, index], self.draws) + offset[:, index]
-        return SampledTrajectories(draws, draws.mean(axis=0), draws.std(axis=0, ddof=1))
+        return jnp.einsum("kcn,skn->skc", matrix[:, columns], self.draws) + offset[:, columns]
+
+    def _moments(self, index: int) -> MeanSd:
+        draws = self._inputs(slice(index, index + 1))[:, :, 0]
+        return MeanSd(draws.mean(axis=0), draws.std(axis=0, ddof=1))
 
 
 def particle_smoother(key: jax.Array, model: LatentForceModel, times: ArrayLike, y: ArrayLike, *,

@@ -39,8 +39,8 @@ def plot_field(result: Any, field: Any, points: Any = None, *, width: str | floa
     Example:
         >>> import lfm_ppl as lfm
         >>> from lfm_ppl.results.arviz_data import build
-        >>> states = (("chain", "draw", "at", "state"), np.random.default_rng(0).normal(size=(2, 5, 4, 3)))
-        >>> named = {"at": np.arange(4.0), "draw": np.arange(5), "state": ["mode 0", "mode 1", "mode 2"]}
+        >>> states = (("chain", "draw", "time", "state"), np.random.default_rng(0).normal(size=(2, 5, 4, 3)))
+        >>> named = {"time": np.arange(4.0), "draw": np.arange(5), "state": ["mode 0", "mode 1", "mode 2"]}
         >>> posterior = xr.Dataset({"decay": (("chain", "draw"), np.ones((2, 5)))}, {"draw": np.arange(5)})
         >>> result = build({"trajectories": xr.Dataset({"states": states}, named), "posterior": posterior})
         >>> plot_field(result, lfm.LaplaceBasis((0.0, 1.0), 3), sensors=[0.5], name="heat").axes[0].get_ylabel()
@@ -51,8 +51,8 @@ def plot_field(result: Any, field: Any, points: Any = None, *, width: str | floa
                else evaluate_field(view, field, points, **options))
     dataset = dataset.isel(place=np.lexsort(dataset["r"].values.T))
     kinds = [kind for kind in _COLOURS if kind in dataset]
-    snapshots = dataset.isel(at=[round(share * (dataset.sizes["at"] - 1)) for share in _SNAPSHOTS])
-    titles = [f"t = {time:.3g} {view.time_unit}".strip() for time in snapshots["at"].values]
+    snapshots = dataset.isel(time=[round(share * (dataset.sizes["time"] - 1)) for share in _SNAPSHOTS])
+    titles = [f"t = {time:.3g} {view.time_unit}".strip() for time in snapshots["time"].values]
     if dataset.sizes["axis"] == 1:
         figure = style.new_figure(width, 1.15 * len(kinds) + 2.0)
         grid = figure.add_gridspec(len(kinds) + 1, len(titles), height_ratios=[1.0] * len(kinds) + [1.25])
@@ -64,7 +64,7 @@ def plot_field(result: Any, field: Any, points: Any = None, *, width: str | floa
         bands: list[Axes] = []
         for column, title in enumerate(titles):
             bands.append(figure.add_subplot(grid[-1, column], sharey=bands[0] if bands else None))
-            _draw_band(bands[-1], snapshots.isel(at=column), title)
+            _draw_band(bands[-1], snapshots.isel(time=column), title)
             bands[-1].tick_params(labelleft=column == 0)
         style.label_values(bands[0], dataset.attrs["name"], dataset.attrs["unit"], titles[0])
     else:
@@ -98,11 +98,11 @@ def _add_colour_bar(figure: Figure, mesh: Any, panels: Any, dataset: xr.Dataset,
 
 def _draw_against_time(figure: Figure, axes: Axes, dataset: xr.Dataset, kind: str) -> None:
     style.tidy(axes, ylabel=_place_label(dataset))
-    mesh = axes.pcolormesh(dataset["at"].values, dataset["r"].values[:, 0], dataset[kind].values.T,
+    mesh = axes.pcolormesh(dataset["time"].values, dataset["r"].values[:, 0], dataset[kind].values.T,
                            **_colours(dataset, kind))
     _add_colour_bar(figure, mesh, axes, dataset, kind)
     if "sensors" in dataset:
-        axes.plot(dataset["at"].values, dataset["sensors"].values[:, :, 0], color="white", lw=0.6, ls=":")
+        axes.plot(dataset["time"].values, dataset["sensors"].values[:, :, 0], color="white", lw=0.6, ls=":")
 
 
 def _draw_band(axes: Axes, snapshot: xr.Dataset, title: str) -> None:

@@ -51,7 +51,7 @@ def is_made_later(view: ResultView) -> bool:
     """Return whether the predictions reach beyond the data and the trajectories of the fit."""
     last, end = forecast_span(view)
     return last < end and not ("trajectories" in view.groups and
-                               times_of(view.groups["trajectories"], "at").values.max() >= end)
+                               times_of(view.groups["trajectories"]).values.max() >= end)
 
 
 def without_forecast(view: ResultView) -> ResultView:
@@ -70,7 +70,7 @@ def forecast_window(view: ResultView) -> tuple[float, float] | None:
     times = view.groups["data"]["time"].values
     start = min(last - 2.0 * (end - last), times[-_FEWEST_ROWS:][0])
     if "trajectories" in view.groups:
-        start = min(start, view.groups["trajectories"]["at"].values[-_FEWEST_ROWS:][0])
+        start = min(start, view.groups["trajectories"]["time"].values[-_FEWEST_ROWS:][0])
     return None if end - last >= _SMALLEST_SHARE * (end - times[0]) or start <= times[0] else (start, end)
 
 
@@ -83,7 +83,7 @@ def recent_part(view: ResultView) -> tuple[ResultView, str]:
     groups = {}
     for name, dataset in view.groups.items():
         # Known inputs have times of their own, such as ``dose_time``, and resets.
-        clocks = [clock for clock in dataset.dims if clock in ("time", "at", "at_truth") or
+        clocks = [clock for clock in dataset.dims if clock == "time" or
                   name in (CONSTANT, FORECAST) and str(clock).endswith(("_time", "_reset"))]
         groups[name] = dataset.isel({clock: dataset[clock].values >= window[0] for clock in clocks})
         if ENTRY in dataset.dims:

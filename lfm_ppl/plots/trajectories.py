@@ -65,10 +65,10 @@ def plot_fit(result: Any, outputs: Sequence[str] | None = None, *, series: Any =
     Example:
         >>> from lfm_ppl.results.arviz_data import build
         >>> time = np.linspace(0.0, 9.0, 10)
-        >>> dims = ("chain", "draw", "at", "output")
+        >>> dims = ("chain", "draw", "time", "output")
         >>> mean = xr.Dataset({"outputs": (dims, np.ones((2, 5, 10, 1)))})
         >>> data = xr.Dataset({"y": (("time", "output"), np.ones((10, 1)), {"units": "nM"})})
-        >>> mean = mean.assign_coords({"at": time, "output": ["mRNA"]})
+        >>> mean = mean.assign_coords({"time": time, "output": ["mRNA"]})
         >>> data = data.assign_coords({"time": time, "output": ["mRNA"]})
         >>> figure = plot_fit(build({"trajectories": mean, "data": data}))
         >>> figure.axes[0].get_ylabel()
@@ -111,9 +111,9 @@ def plot_forces(result: Any, forces: Sequence[str] | None = None, *, series: Any
 
     Example:
         >>> from lfm_ppl.results.arviz_data import build
-        >>> dims = ("chain", "draw", "at", "force")
+        >>> dims = ("chain", "draw", "time", "force")
         >>> draws = xr.Dataset({"forces": (dims, np.zeros((2, 5, 10, 1)))})
-        >>> draws = draws.assign_coords({"at": np.linspace(0.0, 9.0, 10), "force": ["p53"]})
+        >>> draws = draws.assign_coords({"time": np.linspace(0.0, 9.0, 10), "force": ["p53"]})
         >>> figure = plot_forces(build({"trajectories": draws}), ["p53"], width="full")
         >>> [axes.get_ylabel() for axes in figure.axes]
         ['p53']
@@ -142,9 +142,9 @@ def plot_states(result: Any, states: Sequence[str] | None = None, *, series: Any
 
     Example:
         >>> from lfm_ppl.results.arviz_data import build
-        >>> dims = ("chain", "draw", "at", "state")
+        >>> dims = ("chain", "draw", "time", "state")
         >>> draws = xr.Dataset({"states": (dims, np.zeros((2, 5, 10, 2)))})
-        >>> draws = draws.assign_coords({"at": np.linspace(0.0, 9.0, 10), "state": ["x", "v"]})
+        >>> draws = draws.assign_coords({"time": np.linspace(0.0, 9.0, 10), "state": ["x", "v"]})
         >>> [axes.get_ylabel() for axes in plot_states(build({"trajectories": draws})).axes]
         ['x', 'v']
     """
@@ -170,9 +170,9 @@ def plot_deterministics(result: Any, names: Sequence[str] | None = None, *, seri
 
     Example:
         >>> from lfm_ppl.results.arviz_data import build
-        >>> dims = ("chain", "draw", "at", "deterministic")
+        >>> dims = ("chain", "draw", "time", "deterministic")
         >>> draws = xr.Dataset({"deterministics": (dims, np.zeros((2, 5, 10, 1)))})
-        >>> draws = draws.assign_coords({"at": np.linspace(0.0, 9.0, 10), "deterministic": ["uptake"]})
+        >>> draws = draws.assign_coords({"time": np.linspace(0.0, 9.0, 10), "deterministic": ["uptake"]})
         >>> [axes.get_ylabel() for axes in plot_deterministics(build({"trajectories": draws})).axes]
         ['uptake']
     """
@@ -259,13 +259,13 @@ def _draw_kind(view: ResultView, kind: str, selection: Sequence[str] | None, ser
 def _draw_regimes(axes: Axes, view: ResultView, paths: xr.DataArray | None, regimes: Sequence[str], title: str) -> None:
     """Draw the probabilities of the regimes as areas, with their predictions (chain, draw, time, state) or None."""
     probability = _trajectories(view, "state").sel(state=list(regimes)).mean(["chain", "draw"])
-    times = probability["at"].values
+    times = probability["time"].values
     if paths is not None:
         later = paths.sel(state=list(regimes), time=paths["time"] > times[-1]).mean(["chain", "draw"])
-        probability = xr.concat([probability, later.rename(time="at")], "at", coords="minimal", compat="override")
+        probability = xr.concat([probability, later], "time", coords="minimal", compat="override")
         forecasts.mark_last_observation(axes, view)
     colours = dict(zip(regimes, itertools.cycle(style.CHAIN_COLOURS), strict=False))
-    axes.stackplot(probability["at"].values, probability.transpose("state", "at").values, labels=regimes, lw=0,
+    axes.stackplot(probability["time"].values, probability.transpose("state", "time").values, labels=regimes, lw=0,
                    colors=colours.values(), alpha=0.6)
     ticks = {0.0: "0", 0.5: "0.5", 1.0: "1"}
     for regime, colour in colours.items():
@@ -279,7 +279,7 @@ def _draw_regimes(axes: Axes, view: ResultView, paths: xr.DataArray | None, regi
 
 def _season_windows(draws: xr.DataArray, end: float) -> dict[str, tuple[float, float]]:
     """Return the interval of time to show of each force that repeats often, about the end of its trajectories."""
-    times = draws["at"].values
+    times = draws["time"].values
     periods = json.loads(draws.attrs.get(PERIODS, "{}"))
     return {name: (times[-1] - SHOWN_PERIODS * period, times[-1] + SHOWN_PERIODS * period)
             for name, period in periods.items() if repeats_often(period, max(end, times[-1]) - times[0])}
@@ -299,7 +299,7 @@ def _trajectories(view: ResultView, kind: str) -> xr.DataArray:
         raise ValueError(f"the result holds no {kind} trajectories; its group trajectories has "
                          f"{', '.join(map(str, dataset.data_vars))}. They come from lfm.fit with trajectory_draws "
                          f"above zero, for a model that has {kind}s.")
-    return dataset[f"{kind}s"].transpose("chain", "draw", ..., "at", kind)
+    return dataset[f"{kind}s"].transpose("chain", "draw", ..., "time", kind)
 
 
 def _draw_truth(axes: Axes, view: ResultView, kind: str, name: str) -> None:
@@ -314,7 +314,7 @@ def _true_path(axes: Axes, view: ResultView, kind: str, name: str) -> tuple[np.n
     truth = view.groups.get("truth", xr.Dataset()).get(f"{kind}s")
     if truth is None or kind not in truth.dims or name not in truth[kind].values:
         return None
-    times, (low, high) = truth["at_truth"].values, axes.dataLim.intervalx
+    times, (low, high) = truth["time"].values, axes.dataLim.intervalx
     is_shown = (times >= low) & (times <= high) | (low > high)  # nothing else is drawn yet
     return (times[is_shown], truth.sel({kind: name}).values[is_shown]) if is_shown.any() else None
 
@@ -394,16 +394,16 @@ def _band(view: ResultView, kind: str, name: str) -> tuple[np.ndarray, np.ndarra
     draws = _trajectories(view, kind).sel({kind: name})
     summary = _summary(view, f"{kind}s")
     if summary is not None:
-        return draws["at"].values, *summary.sel({kind: name}).values
-    flat = draws.values.reshape(-1, draws.sizes["at"])
+        return draws["time"].values, *summary.sel({kind: name}).values
+    flat = draws.values.reshape(-1, draws.sizes["time"])
     low, high = np.quantile(flat, INTERVAL, axis=0)
-    return draws["at"].values, flat.mean(axis=0), low, high
+    return draws["time"].values, flat.mean(axis=0), low, high
 
 
 def _summary(view: ResultView, name: str) -> xr.DataArray | None:
     """Return the summary (statistic, at, ...) of trajectories; None where there are draws alone."""
     summary = view.group("trajectories").get(f"{name}_summary")
-    return None if summary is None else summary.transpose("statistic", "at", ...)
+    return None if summary is None else summary.transpose("statistic", "time", ...)
 
 
 def _draw_data(axes: Axes, view: ResultView, name: str) -> None:

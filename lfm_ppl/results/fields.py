@@ -44,8 +44,8 @@ def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any 
     Example:
         >>> import lfm_ppl as lfm
         >>> from lfm_ppl.results.arviz_data import build
-        >>> states = (("chain", "draw", "at", "state"), np.ones((2, 5, 4, 1)))
-        >>> named = {"at": np.arange(4.0), "draw": np.arange(5), "state": ["mode 0"]}
+        >>> states = (("chain", "draw", "time", "state"), np.ones((2, 5, 4, 1)))
+        >>> named = {"time": np.arange(4.0), "draw": np.arange(5), "state": ["mode 0"]}
         >>> posterior = xr.Dataset({"decay": (("chain", "draw"), np.ones((2, 5)))}, {"draw": np.arange(5)})
         >>> result = build({"trajectories": xr.Dataset({"states": states}, named), "posterior": posterior})
         >>> evaluate_field(result, lfm.LaplaceBasis((0.0, 1.0), 1), [0.5])["mean"].values[0].round(4).tolist()
@@ -68,9 +68,9 @@ def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any 
     positions = np.asarray(_grid(example.domain) if points is None else points, float)
     weights, variance = jax.jit(jax.vmap(
         lambda values: jax.tree.map(jax.numpy.asarray, make(values).weights(positions))))(parameters)
-    coefficients = _coefficients(trajectories, example.names).drop_duplicates("at")
-    values = coefficients.transpose("chain", "draw", "at", ...).values
-    times, dims = coefficients["at"].values, ("at", "place")
+    coefficients = _coefficients(trajectories, example.names).drop_duplicates("time")
+    values = coefficients.transpose("chain", "draw", "time", ...).values
+    times, dims = coefficients["time"].values, ("time", "place")
     draws = values.reshape(-1, *values.shape[2:]) @ np.asarray(weights).swapaxes(1, 2)
     variables = {"draws": (("chain", "draw", *dims), draws.reshape(*values.shape[:2], *draws.shape[1:])),
                  "mean": (dims, draws.mean(0)),
@@ -79,8 +79,8 @@ def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any 
         variables["truth"] = (dims, truth)
     if sensors is not None:
         sensor_positions = np.stack([np.asarray(sensors(t) if callable(sensors) else sensors, float) for t in times])
-        variables["sensors"] = (("at", "sensor", "axis"), sensor_positions.reshape(*sensor_positions.shape[:2], -1))
-    coords = {"at": coefficients["at"], "r": (("place", "axis"), positions.reshape(len(positions), -1))}
+        variables["sensors"] = (("time", "sensor", "axis"), sensor_positions.reshape(*sensor_positions.shape[:2], -1))
+    coords = {"time": coefficients["time"], "r": (("place", "axis"), positions.reshape(len(positions), -1))}
     return xr.Dataset(variables, coords, {"name": name, "unit": unit, "length_unit": length_unit})
 
 
@@ -108,7 +108,7 @@ def _truth(view: ResultView, make: Callable[[Any], Any], positions: np.ndarray, 
         paths = _coefficients(truth, field.names)
     except (KeyError, ValueError):
         return None
-    paths = paths.drop_duplicates("at_truth").interp(at_truth=times).transpose("at_truth", ...)
+    paths = paths.drop_duplicates("time").interp(time=times).transpose("time", ...)
     return paths.values @ np.asarray(field.weights(positions)[0]).T
 
 

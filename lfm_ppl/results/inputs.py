@@ -65,7 +65,7 @@ def remember(groups: dict[str, xr.Dataset], data: Data | None, origin: str | Non
     if data is not None and data.inputs:
         groups[GROUP] = to_dataset(data.inputs, data.units)
     for dataset in groups.values():
-        for name in {"time", "at", "at_truth", "times"} & set(dataset.coords):
+        for name in {"time", "times"} & set(dataset.coords):
             if unit and not dataset[name].attrs.get("units"):
                 dataset[name].attrs["units"] = unit
     return {} if origin is None else {ORIGIN: origin}

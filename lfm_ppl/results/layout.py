@@ -65,7 +65,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
     panel = () if labels.series is None else (labels.series,)
     along = (*panel, "time")
     coords: dict[str, Any] = {"chain": np.arange(chains), "draw": np.arange(samples)}
-    clock: dict[str, Any] = time_coordinate("time", times, panel, units)
+    clock: dict[str, Any] = time_coordinate(times, panel, units)
     outputs = labels.coords.get(OUTPUT, list(model.output_names))
     units = units | {new: units[old] for old, new in zip(model.output_names, outputs, strict=True) if old in units}
     named = {"output": outputs, "state": list(model.state_names), "force": list(model.force_names),
@@ -106,12 +106,12 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
              "residual": variable((*sample, "output"), split["residual"])}, {**coords, **data_coords})
     if paths is not None:
         thinned = {"chain": np.arange(chains), "draw": draw_index}
-        dimensions = ("chain", "draw", *panel, "at")
-        at_coords = {} if grid is None else time_coordinate("at", grid, panel, units)
+        dimensions = ("chain", "draw", *panel, "time")
+        path_coords = {} if grid is None else time_coordinate(grid, panel, units)
         groups["trajectories"] = xr.Dataset(
             {f"{kind}s": variable((*dimensions, kind), paths[kind], named[kind])
              for kind in named if paths[kind].shape[-1]},
-            {**thinned, **at_coords, **which, **{kind: named[kind] for kind in named if named[kind]}})
+            {**thinned, **path_coords, **which, **{kind: named[kind] for kind in named if named[kind]}})
         groups["trajectories"]["outputs"].attrs["long_name"] = NOISE_FREE
         if periods := force_periods(model):
             groups["trajectories"]["forces"].attrs[PERIODS] = json.dumps(periods)
@@ -123,7 +123,7 @@ def lay_out(bound: BoundModel, draws: dict, stats: dict, scores: dict | None, tr
     if truth:
         groups["truth"] = truth_dataset(truth, named, units, groups["posterior"])
         for kind, values in true_functions(bound, truth, draws).items():
-            new = {f"{kind}s": variable(("at_truth", kind), values, named[kind])}
+            new = {f"{kind}s": variable(("time", kind), values, named[kind])}
             truth_group = groups["truth"]
             if f"{kind}s" in truth_group:  # some of them, by the user
                 truth_group = truth_group.drop_dims(kind)
@@ -219,5 +219,3 @@ def _posterior(draws: dict, coords: dict, named: Mapping[str, list], labels: Lab
             extra[name] = list(ticks) if len(ticks) == size else np.arange(size)
         variables[label] = (("chain", "draw", *dims), value, {DERIVED: 1} if label in labels.derived else {})
     return xr.Dataset(variables, {**coords, **extra})
-
-

@@ -88,7 +88,7 @@ def predictions(bound: BoundModel, paths: Mapping[str, np.ndarray], draw_index: 
     words = {"output": NOISE_FREE, "state": "state", "force": "force", "deterministic": "of state and forces"}
     variables |= {f"{kind}s": variable(kind, paths[kind], word) for kind, word in words.items()
                   if paths[kind].shape[-1]}
-    clock = time_coordinate("time", times, panel, units)
+    clock = time_coordinate(times, panel, units)
     coords = {"chain": np.arange(paths["prediction"].shape[0]), "draw": draw_index, **clock}
     coords |= {name: labels[name] for name in panel if name in labels}
     is_observed = np.isfinite(np.asarray(bound.y)).any(axis=-1)

@@ -200,7 +200,7 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
     arguments = keywords(view, None, model_kwargs)
     settings = dict(view.likelihood_sites)
     try:
-        bound = bind(_as_fitted(numpyro_model, settings or {"": dict(view.attrs)}), times, y, **arguments)
+        bound = bind(_as_fitted(numpyro_model, settings or {"": dict(view.attrs)}), times, y, model_kwargs=arguments)
     except (TypeError, AttributeError) as error:
         missing = _missing_keywords(numpyro_model, arguments)
         if not missing or not re.search("NoneType|required", str(error)):

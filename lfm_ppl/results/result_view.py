@@ -25,7 +25,7 @@ from lfm_ppl.results.scalars import scalar_draws, scalar_truth, unit_of
 ENTRY = "observation"
 """Dimension of the observed entries, with the coordinates time, output and series, in the groups that ArviZ reads."""
 
-DIMENSIONS = (ENTRY, "chain", "draw", "time", "at", "at_truth", "output", "state", "force", "deterministic",
+DIMENSIONS = (ENTRY, "chain", "draw", "time", "output", "state", "force", "deterministic",
               "statistic", "parameter")
 """Dimensions of a result besides that of the series of a panel."""
 
@@ -125,7 +125,7 @@ class ResultView:
         """Raise ValueError for a result with several likelihood sites, of which one has to be selected."""
         if names := list(self.likelihood_sites):
             raise ValueError(f"the result has the likelihood sites {', '.join(names)}, and this takes one; select it: "
-                             f"lfm.select_site(result, {names[0]!r}).")
+                             f"lfm.select_series(result, {names[0]!r}).")
 
     @property
     def is_part(self) -> bool:
@@ -167,7 +167,7 @@ class ResultView:
     @cached_property
     def time_unit(self) -> str:
         """The unit of time, empty where the result does not know it."""
-        for name, coordinate in (("data", "time"), ("data", "times"), ("trajectories", "at")):
+        for name, coordinate in (("data", "time"), ("data", "times"), ("trajectories", "time")):
             if name in self.groups and coordinate in self.groups[name].coords:
                 if unit := unit_of(self.groups[name][coordinate]):
                     return unit

@@ -20,6 +20,7 @@ from lfm_ppl.io.input_table import OF_SERIES
 from lfm_ppl.results import arviz_data, inputs
 from lfm_ppl.results.result_view import DIMENSIONS, ENTRY, SELECTED_SERIES, ResultView
 from lfm_ppl.results.scalars import unit_of, units_attribute
+from lfm_ppl.results.sites import site_view
 from lfm_ppl.utils import checks
 
 if TYPE_CHECKING:  # figures need no JAX
@@ -43,34 +44,36 @@ def plate_dimension(bound: BoundModel) -> str | None:
     return plates[0] if len(plates) == 1 and plates[0] not in DIMENSIONS else SERIES
 
 
-def times_of(dataset: xr.Dataset, clock: str = "time") -> xr.DataArray:
-    """Return the times along the dimension ``clock`` of a group, (K,), or (B, K) where series have their own."""
-    return dataset[TIMES] if TIMES in dataset.variables else dataset[clock]
+def times_of(dataset: xr.Dataset) -> xr.DataArray:
+    """Return the times of a group, (K,), or (B, K) where series have their own."""
+    return dataset[TIMES] if TIMES in dataset.variables else dataset["time"]
 
 
-def time_coordinate(name: str, times: np.ndarray, panel: tuple[str, ...], units: Mapping[str, str]) -> dict[str, Any]:
-    """Return the coordinate of times (K,) along the dimension ``name``, or (B, K) of series that have their own."""
-    label, dims = (name, (name,)) if np.ndim(times) == 1 else (TIMES, (*panel, name))
+def time_coordinate(times: np.ndarray, panel: tuple[str, ...], units: Mapping[str, str]) -> dict[str, Any]:
+    """Return the coordinate of times (K,) along the dimension "time", or (B, K) of series that have their own."""
+    label, dims = ("time", ("time",)) if np.ndim(times) == 1 else (TIMES, (*panel, "time"))
     return {label: (dims, times, units_attribute(["time"], units))}
 
 
 def select_series(result: Any, series: Any) -> Any:
-    """Return one series of a panel as a result of one series, for figures, tables and the report.
+    """Return one series of a panel, or one of several likelihood sites, as a result of one series.
 
-    Rows that pad the series, all missing at the time of the row before, are left out, and so is the accuracy report,
-    which is about the panel. Parameters that series share stay as they are.
+    Figures, tables, scores and reports of one series take it. Rows that pad the series, all missing at the time of the
+    row before, are left out, and so is the accuracy report, which is about the panel. Parameters that series share stay
+    as they are. The observations of a likelihood site are called ``y``, whatever its name.
 
     Args:
-        result: of a panel.
-        series: label of the series, or its position where no label equals it.
+        result: what `lfm_ppl.fit` or `lfm_ppl.forecast` returned for a panel, or for a model with several likelihood
+            sites.
+        series: label of the series, or its position where no label equals it; name of the site.
 
     Returns:
-        An ArviZ object with the names and dimensions of a result of one series. Its attribute ``selected``
-        names the series. `lfm_ppl.forecast` takes it with the model of the panel; `lfm_ppl.check_accuracy` takes the
-        panel instead.
+        An ArviZ object with the names and dimensions of a result of one series, which shares the arrays of ``result``.
+        Its attribute ``selected`` names the series of a panel. `lfm_ppl.forecast` takes it with the model of the panel
+        or of all sites; `lfm_ppl.check_accuracy` takes the whole result instead.
 
     Raises:
-        ValueError: the result is of one series, or has no such series.
+        ValueError: the result is of one series, or has no such series or site.
 
     Example:
         >>> y = xr.Dataset({"y": (("patient", "time", "output"), np.arange(4.0).reshape(2, 2, 1))})
@@ -81,7 +84,8 @@ def select_series(result: Any, series: Any) -> Any:
         >>> one["data"]["y"].values.ravel().tolist(), one["posterior"]["rate"].dims
         ([2.0, 3.0], ('chain', 'draw'))
     """
-    selected = series_view(ResultView.of(result), series)
+    view = ResultView.of(result)
+    selected = site_view(view, series) if view.likelihood_sites else series_view(view, series)
     return arviz_data.build(selected.groups, selected.attrs)
 
 
@@ -101,7 +105,10 @@ def series_view(view: ResultView, series: Any) -> ResultView:
         if label in _NOT_OF_SERIES:
             continue
         dataset = _select(dataset, dimension, index, labels[index])
-        if label in ("data", "one_step_ahead"):
+        if label == "trajectories" and TIMES in view.groups[label].variables:
+            # The times of trajectories are padded by the last one.
+            dataset = dataset.isel(time=np.diff(dataset["time"].values, prepend=-np.inf) > 0)
+        elif label in ("data", "one_step_ahead"):
             dataset = dataset.isel(time=is_observed[index] | is_later)
         elif label in (inputs.GROUP, inputs.FORECAST):
             dataset = _select_inputs(view.group(label), str(labels[index]))
@@ -194,10 +201,8 @@ def _select(dataset: xr.Dataset, dimension: str, index: int, label: Any) -> xr.D
         dataset = dataset.isel({dimension: index}, drop=True)
     if TIMES not in dataset.variables:
         return dataset
-    clock, times = "at" if "at" in dataset.dims else "time", dataset[TIMES]
-    dataset = dataset.drop_vars(TIMES).assign_coords({clock: (clock, times.values, times.attrs)})
-    # The times of trajectories are padded by the last one.
-    return dataset.isel(at=np.diff(times.values, prepend=-np.inf) > 0) if clock == "at" else dataset
+    times = dataset[TIMES]
+    return dataset.drop_vars(TIMES).assign_coords(time=("time", times.values, times.attrs))
 
 
 def _select_mode(view: ResultView, dimension: str, index: int) -> dict[str, Any]:

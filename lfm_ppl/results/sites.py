@@ -5,7 +5,7 @@
    ``y_observation``. There the log likelihood has no coordinates, which ArviZ cannot stack across variables; the
    observed data have them.
 3. Every other group belongs to one site and has its name: ``trajectories_y``.
-4. `select_site` keeps the groups of the data of other sites, which the model needs for a forecast.
+4. `site_view` keeps the groups of the data of other sites, which the model needs for a forecast.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ from collections.abc import Mapping
 
 import xarray as xr
 
-from lfm_ppl.results import arviz_data, inputs
+from lfm_ppl.results import inputs
 from lfm_ppl.results.result_view import LIKELIHOODS, SELECTED_SITE, ResultView
 from lfm_ppl.utils import checks
-from lfm_ppl.utils.types import Result
 
 _COMMON = ("posterior", "sample_stats", "log_prior", "accuracy")
 """Groups that do not depend on the site."""
@@ -56,40 +55,8 @@ def merge_sites(sites: Mapping[str, Mapping[str, xr.Dataset]]) -> dict[str, xr.D
     return merged
 
 
-def select_site(result: Result, name: str) -> Result:
-    """Return the part of a result that belongs to one likelihood site, as a result of a model with that site alone.
-
-    Figures, tables, scores and reports of one site take it. Its observations are called ``y``, whatever the name of the
-    site.
-
-    Args:
-        result: what `lfm_ppl.fit` or `lfm_ppl.forecast` returned for a model with several likelihood sites.
-        name: name of the site.
-
-    Returns:
-        An ArviZ object with the groups of `lfm_ppl.fit`; it shares the arrays of ``result``. `lfm_ppl.forecast` takes
-        it with the model of all sites, whose data are in its groups ``data_SITE`` and ``constant_data_SITE``.
-
-    Raises:
-        ValueError: the result has no such site.
-
-    Example:
-        >>> import numpy as np, lfm_ppl as lfm
-        >>> groups = {name: {"observed_data": xr.Dataset({name: ("observation", np.zeros(count))})}
-        ...           for name, count in (("short", 2), ("long", 5))}
-        >>> merged = merge_sites(groups)["observed_data"]
-        >>> merged["long"].dims
-        ('long_observation',)
-        >>> result = arviz_data.build({"observed_data": merged}, {"likelihood_sites": '{"short": {}, "long": {}}'})
-        >>> lfm.select_site(result, "long")["observed_data"]["y"].dims
-        ('observation',)
-    """
-    selected = site_view(ResultView.of(result), name)
-    return arviz_data.build(selected.groups, selected.attrs)
-
-
 def site_view(view: ResultView, name: str) -> ResultView:
-    """Return the view of one likelihood site of several, see `select_site`."""
+    """Return the view of one likelihood site of several, see `lfm_ppl.select_series`."""
     settings = view.likelihood_sites
     if name not in settings:
         raise ValueError(checks.unknown("likelihood site", name, settings) if settings else

@@ -112,18 +112,18 @@ def truth_dataset(truth: Mapping[str, Any], named: dict, units: Mapping[str, str
     variables: dict[str, Any] = {}
     coords: dict[str, Any] = {}
     if truth.get("times") is not None:
-        coords["at_truth"] = ("at_truth", np.asarray(truth["times"], float), units_attribute(["time"], units))
+        coords["time"] = ("time", np.asarray(truth["times"], float), units_attribute(["time"], units))
     for kind in ("force", "deterministic"):
         paths = truth.get(f"{kind}s") or {}
         stored_labels = [label for label in named[kind] if label in paths]
         if stored_labels:
             coords[kind] = stored_labels
             values = np.stack([np.asarray(paths[label]) for label in stored_labels], axis=1)
-            variables[f"{kind}s"] = (("at_truth", kind), values,
+            variables[f"{kind}s"] = (("time", kind), values,
                                      units_attribute(stored_labels, units))
     if _true_states(truth).shape[1:] == (len(named["state"]),):
         coords["state"] = named["state"]
-        variables["states"] = (("at_truth", "state"), np.asarray(truth["state"]),
+        variables["states"] = (("time", "state"), np.asarray(truth["state"]),
                                units_attribute(named["state"], units))
     for label, value in (truth.get("parameters") or {}).items():
         value = np.asarray(value, float)

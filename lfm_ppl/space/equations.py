@@ -7,7 +7,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 
 from lfm_ppl.forces.parameters import non_negative_parameter
@@ -16,11 +15,10 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.space.eigenfunctions import LaplaceBasis
 from lfm_ppl.space.fields import SpectralField
-from lfm_ppl.utils import checks
 
 
-def heat(source: SpectralField | LaplaceBasis, diffusivity: ArrayLike, decay: ArrayLike, *, sensors: Any, noise: Any,
-         initial: Gaussian | None = None, **options: Any) -> LatentForceModel:
+def heat(source: SpectralField | LaplaceBasis, diffusivity: ArrayLike, decay: ArrayLike, *, sensors: Any,
+         sd: Any = None, covariance: Any = None, initial: Gaussian | None = None, **options: Any) -> LatentForceModel:
     r"""Return the heat equation with an unknown source, ``x_t = diffusivity laplacian x - decay x + s(r, t)``.
 
     The states are the coefficients of x in the basis, "mode 0", "mode 1", ...; the source has the forces u_j:
@@ -34,7 +32,8 @@ def heat(source: SpectralField | LaplaceBasis, diffusivity: ArrayLike, decay: Ar
         diffusivity: in length^2/time; zero or above.
         decay: rate at which heat is lost to the surroundings, in 1/time; zero or above.
         sensors: places (D,) or (D, d) in the domain, or a function of time that returns them.
-        noise: variance of the measurements, or any covariance of `GaussianObservation`.
+        sd: standard deviation of the measurements, as of `GaussianObservation`; a number holds for all sensors.
+        covariance: their covariance instead, as of `GaussianObservation`.
         initial: distribution of the coefficients (J,) at the initial time, see `LaplaceBasis.coefficients`; None: the
             field is zero.
         **options: ``initial_time``, ``output_names``, ``units`` and others of `LatentForceModel`.
@@ -48,7 +47,7 @@ def heat(source: SpectralField | LaplaceBasis, diffusivity: ArrayLike, decay: Ar
         >>> import lfm_ppl as lfm
         >>> basis = lfm.LaplaceBasis((0.0, 1.0), 8, "neumann")
         >>> source = lfm.SpectralField(basis, lfm.Matern(1.0, 0.4), lfm.Matern(1.0, 2.0))
-        >>> model = lfm.heat(source, 0.02, 0.1, sensors=np.array([0.1, 0.5, 0.9]), noise=0.01)
+        >>> model = lfm.heat(source, 0.02, 0.1, sensors=np.array([0.1, 0.5, 0.9]), sd=0.1)
         >>> len(model.state_names), model.output_names
         (8, ('sensor 0', 'sensor 1', 'sensor 2'))
 
@@ -57,11 +56,12 @@ def heat(source: SpectralField | LaplaceBasis, diffusivity: ArrayLike, decay: Ar
     basis = _basis(source)
     rates = (non_negative_parameter("diffusivity", diffusivity) * basis.wavenumbers**2
              + non_negative_parameter("decay", decay))
-    return _model(source, lambda x, s: s - rates * x, basis.names, sensors, noise, initial, options)
+    return _model(source, lambda x, s: s - rates * x, basis.names, sensors,
+                  {"sd": sd, "covariance": covariance}, initial, options)
 
 
-def wave(source: SpectralField | LaplaceBasis, speed: ArrayLike, damping: ArrayLike, *, sensors: Any, noise: Any,
-         initial: Gaussian | None = None, **options: Any) -> LatentForceModel:
+def wave(source: SpectralField | LaplaceBasis, speed: ArrayLike, damping: ArrayLike, *, sensors: Any, sd: Any = None,
+         covariance: Any = None, initial: Gaussian | None = None, **options: Any) -> LatentForceModel:
     r"""Return the wave equation with an unknown source, ``x_tt = speed^2 laplacian x - damping x_t + s(r, t)``.
 
     The states are the coefficients of the basis, "mode 0", "mode 1", ..., and then their rates of change, "rate of
@@ -74,7 +74,8 @@ def wave(source: SpectralField | LaplaceBasis, speed: ArrayLike, damping: ArrayL
         speed: in length/time; zero or above.
         damping: in 1/time; zero or above.
         sensors: as of `heat`.
-        noise: as of `heat`.
+        sd: as of `heat`.
+        covariance: as of `heat`.
         initial: distribution of the coefficients and their rates (2 J,) at the initial time; None: zero.
         **options: as of `heat`.
 
@@ -84,7 +85,7 @@ def wave(source: SpectralField | LaplaceBasis, speed: ArrayLike, damping: ArrayL
     Example:
         >>> import numpy as np
         >>> import lfm_ppl as lfm
-        >>> model = lfm.wave(lfm.LaplaceBasis((0.0, 1.0), 8), 1.0, 0.1, sensors=np.array([0.5]), noise=0.01)
+        >>> model = lfm.wave(lfm.LaplaceBasis((0.0, 1.0), 8), 1.0, 0.1, sensors=np.array([0.5]), sd=0.1)
         >>> model.state_names[8]
         'rate of mode 0'
 
@@ -98,7 +99,7 @@ def wave(source: SpectralField | LaplaceBasis, speed: ArrayLike, damping: ArrayL
         return jnp.concatenate([x[size:], s - stiffness * x[:size] - friction * x[size:]])
 
     names = (*basis.names, *(f"rate of {name}" for name in basis.names))
-    return _model(source, equation, names, sensors, noise, initial, options)
+    return _model(source, equation, names, sensors, {"sd": sd, "covariance": covariance}, initial, options)
 
 
 def _basis(source: Any) -> LaplaceBasis:
@@ -108,9 +109,12 @@ def _basis(source: Any) -> LaplaceBasis:
     return source.basis if isinstance(source, SpectralField) else source
 
 
-def _model(source: Any, equation: Callable, state_names: Sequence[str], sensors: Any, noise: Any,
+def _model(source: Any, equation: Callable, state_names: Sequence[str], sensors: Any, noise: dict[str, Any],
            initial: Gaussian | None, options: dict[str, Any]) -> LatentForceModel:
-    """Return the model of an equation, a map from coefficients and source to rates of change."""
+    """Return the model of an equation, a map from coefficients and source to rates of change.
+
+    ``noise`` are the keyword arguments ``sd`` and ``covariance`` of `GaussianObservation`.
+    """
     basis, size, has_source = _basis(source), len(state_names), isinstance(source, SpectralField)
     amplitudes = source.amplitudes if has_source else 0.0
     functions = None if callable(sensors) else basis.functions(sensors)
@@ -122,11 +126,8 @@ def _model(source: Any, equation: Callable, state_names: Sequence[str], sensors:
     outputs = jax.eval_shape(readings, jnp.zeros(size), jnp.zeros(0), jnp.zeros(())).shape[0]
     if initial is not None and initial.mean.shape != (size,):
         raise ValueError(f"initial must be a distribution of {size} coefficients, got {initial.mean.shape[0]}.")
-    if not callable(noise) and np.ndim(noise) == 0:
-        checks.positive("noise", noise)
-        noise = noise * jnp.ones(outputs)
     options = {"output_names": [f"sensor {index}" for index in range(outputs)], **options}
     initial = Gaussian(jnp.zeros(size), jnp.zeros(size)) if initial is None else initial
     return LatentForceModel(
         lambda x, u, t: equation(x, amplitudes * u if has_source else 0.0), source.forces if has_source else {},
-        GaussianObservation(readings, noise), initial, state_names=state_names, **options)
+        GaussianObservation(readings, **noise), initial, state_names=state_names, **options)

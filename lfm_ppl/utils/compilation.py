@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from pathlib import Path
 
 _SHARE = "/sys/fs/cgroup/cpu.max"
@@ -15,6 +16,10 @@ _OLDER = "/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "/sys/fs/cgroup/cpu/cpu.cfs_peri
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 _BYTES = 1_000_000
 _FLAG = "--xla_backend_extra_options="
+_DEVICES = "--xla_force_host_platform_device_count"
+
+MOST_DEVICES = 64
+"""Largest number of devices of a process, one for each chain."""
 
 ONE_THREAD = {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """Environment in which a process computes with one thread: JAX reads it at its first computation, NumPy when imported.
@@ -45,12 +50,7 @@ def fast_loops() -> None:
     JAX 0.10, the newest for Python 3.11, hands every operation of every pass through a loop to its runtime; with this
     setting filters and their gradients take a half to a quarter of the time there. From JAX 0.12 on it is how loops are
     compiled anyway. The option is added to the environment variable ``XLA_FLAGS``, which XLA reads at the first
-    computation: call this before it, as ``numpyro.set_host_device_count``. An option that is set already stays.
-    The command line does this.
-
-    Example:
-        >>> import lfm_ppl as lfm
-        >>> lfm.fast_loops()
+    computation. An option that is set already stays. `prepare_chains` and the command line call this.
     """
     words = os.environ.get("XLA_FLAGS", "").split()
     if any(_OPTION in word for word in words):
@@ -63,6 +63,26 @@ def fast_loops() -> None:
     else:
         words.append(_FLAG + option)
     os.environ["XLA_FLAGS"] = " ".join(words)
+
+
+def prepare_chains(chains: int) -> None:
+    """Give JAX a CPU device for each chain, and `fast_loops`; without effect after its first computation.
+
+    JAX fixes the devices, and reads XLA's flags, at that computation. A number of devices that is set already, by
+    ``numpyro.set_host_device_count`` or JAX's own option, stays. Devices of a process with one thread would only take
+    turns, so it keeps one.
+    """
+    import jax
+
+    if one_thread() or jax.config.jax_num_cpu_devices >= 0:  # type: ignore[attr-defined]
+        return
+    flag = re.search(rf"{_DEVICES}=(\d+)", os.environ.get("XLA_FLAGS", ""))
+    try:
+        # JAX refuses a new number once it has computed; XLA's flags would then only change the keys of its cache.
+        jax.config.update("jax_num_cpu_devices", int(flag[1]) if flag else min(chains, MOST_DEVICES))
+    except RuntimeError:
+        return
+    fast_loops()
 
 
 def quick_compilation(level: int) -> None:

@@ -9,6 +9,7 @@ Source: Hyndman and Athanasopoulos (2021), Forecasting: Principles and Practice,
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -82,7 +83,7 @@ class Backtest:
 
 def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, *, horizon: int, every: int = 1,
              first: int | None = None, season: int | None = None, sampler: str = "map", draws: int = 400,
-             level: float = 0.95, seed: int = 0, progress: bool = False, **options: Any) -> Backtest:
+             level: float = 0.95, seed: int = 0, progress: bool = True, **options: Any) -> Backtest:
     """Fit to the data up to an origin, predict what follows, move the origin on, and score it all.
 
     Each fit has the shape of the whole data, with NaN in the place of what is not known yet, so that everything is
@@ -197,7 +198,7 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
         naive.append((mean, gaussian_scores(mean, sd, target, level)))
         if progress:
             print(f"origin {times[origin]:g}: RMSE {summary(origin_scores, level)['rmse']:.4g}, {reference} "
-                  f"{summary(naive[-1][1], level)['rmse']:.4g}", flush=True)
+                  f"{summary(naive[-1][1], level)['rmse']:.4g}", file=sys.stderr, flush=True)
     if messages:
         checks.warn(f"{len(messages)} warnings at the origins, the first of them at {messages[0]}", ConvergenceWarning)
     dataset = _dataset((forecasts, naive), reference, times, origins, horizon, names or model.output_names)

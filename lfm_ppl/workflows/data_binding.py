@@ -278,7 +278,8 @@ def _bind(numpyro_model: Callable, records: Mapping[str, _Record], is_by_site: b
     times, y = ({name: getattr(record, field) for name, record in records.items()} for field in ("times", "y"))
     keywords = (keywords_by_site(inputs) if is_by_site else inputs[""]) | dict(model_kwargs or {})
     try:
-        return bind(numpyro_model, times if is_by_site else times[""], y if is_by_site else y[""], **keywords)
+        return bind(numpyro_model, times if is_by_site else times[""], y if is_by_site else y[""],
+                    model_kwargs=keywords)
     except TypeError as error:
         if "'NoneType'" not in str(error) or "inputs" in keywords or (
                 "inputs" not in inspect.signature(numpyro_model).parameters):

@@ -23,6 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -45,6 +46,7 @@ from lfm_ppl.results.true_values import checked_truth
 from lfm_ppl.storage import checkpoint as checkpoints
 from lfm_ppl.storage.checkpoint import Checkpoint
 from lfm_ppl.utils import calendar_time, checks
+from lfm_ppl.utils.compilation import prepare_chains
 from lfm_ppl.utils.progress import waiting
 from lfm_ppl.utils.types import Result, Times
 from lfm_ppl.workflows.data_binding import (
@@ -168,7 +170,8 @@ def fit(
         sampler_options: further arguments of NUTS, `RAM` or `ParticleMarginalRAM`, for example
             ``{"target_accept_prob": 0.95}`` or ``{"particles": 500, "delayed": True}``.
         chain_method: "parallel", "vectorized" or "sequential"; by default parallel where there are as many devices as
-            chains (``numpyro.set_host_device_count(chains)`` before JAX starts), sequential otherwise.
+            chains, sequential otherwise. A fit that is the first computation of JAX makes a device for each chain;
+            later than that, only ``numpyro.set_host_device_count(chains)`` at the beginning of the program does.
         progress: show the progress on standard error: a bar, or a line every 30 s where there is no terminal.
         truth: true values of simulated data (``lfm.Data.truth``), stored in the result for plots; a dict by site.
         name: name of the model in the result.
@@ -219,7 +222,7 @@ def fit(
         With several likelihood sites ``log_likelihood``, ``observed_data`` and ``posterior_predictive`` have a variable
         for each, with a dimension of its own (``a_observation``), and the groups ``data``, ``one_step_ahead``,
         ``trajectories``, ``predictions``, ``truth`` and ``constant_data`` have its name: ``trajectories_a``.
-        `lfm.select_site` returns the part of one site as a result of one site, for figures, scores and tables.
+        `lfm.select_series` returns the part of one site as a result of one site, for figures, scores and tables.
 
     Raises:
         ValueError, TypeError: unknown sampler, wrong shapes, unknown parameters in ``fixed``, and so on; other model,
@@ -255,6 +258,7 @@ def fit(
         samples = 400 if sampler == "map" else 1000
     check_sizes(sampler, chains, warmup, samples, thin, trajectory_draws)
     check_options(sampler, sampler_options)
+    prepare_chains(chains)
     if checkpoint is None and resume:
         raise ValueError("resume continues a run that is stored in a folder; name the folder, checkpoint=...")
     if checkpoint is not None:
@@ -279,12 +283,12 @@ def fit(
     requested = {name: site.requested_times for name, site in sites.items()}
     at = None if at is None else requested if bound.is_by_site else requested[bound.site.name]
     if sampler == "map":
-        chains, warmup, thin, chain_method = 1, 0, None, None
+        chains, warmup, thin, method_of_chains = 1, 0, None, None
     else:
         thin = thin or SAMPLERS[sampler].steps_per_draw * bound.size or 1
-        chain_method = sampling.available_method(chain_method, chains)
+        method_of_chains = sampling.available_method(chain_method, chains)
     options = FitOptions(sampler, chains, warmup, samples, thin, seed, dict(fixed or {}), at, trajectory_draws, init,
-                         dict(sampler_options or {}), chain_method, settings)
+                         dict(sampler_options or {}), method_of_chains, settings)
     title = str(name or getattr(numpyro_model, "__name__", "model"))
     description = {
         "model": title, "description": model_docstring(numpyro_model),
@@ -301,6 +305,10 @@ def fit(
         store = checkpoints.begin_or_resume(checkpoint, record, resume)
     if progress:
         print(f"likelihood: {description['likelihood']}", file=sys.stderr, flush=True)
+        if method_of_chains == "sequential" and chain_method is None and jax.default_backend() == "cpu":
+            print(f"The {chains} chains run one after another, because JAX computed before this fit: call "
+                  f"numpyro.set_host_device_count({chains}) at the beginning for chains side by side.",
+                  file=sys.stderr, flush=True)
     with contextlib.closing(store) if store else contextlib.nullcontext(), calendar_time.in_messages(*clock):
         with _explain_start_failure(bound):
             draws = (_draw_about_mode if sampler == "map" else _sample)(problem, store, progress)

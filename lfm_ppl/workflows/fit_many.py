@@ -168,7 +168,7 @@ def fit_many(
     numpyro_model: Callable,
     data_sets: Mapping[str, Any] | Iterable[tuple[str, Any]],
     *,
-    out: str | Path | None = None,
+    checkpoint: str | Path | None = None,
     workers: Workers = 1,
     seed: int = 0,
     each: Mapping[str, Mapping[str, Any]] | None = None,
@@ -188,8 +188,9 @@ def fit_many(
     Args:
         numpyro_model: the model, as in `fit`.
         data_sets: name -> ``(times, y)`` or `lfm.Data`, or an iterable of such pairs. Names are texts.
-        out: folder of the results, so that a stopped run can be resumed: ``fits/``, a file for each data set, and at
-            the end ``summary.csv``, ``posteriors.nc`` and, after failures, ``failed.csv``. None: nothing is stored.
+        checkpoint: folder of the results, so that a stopped run can be resumed: ``fits/``, a file for each data set,
+            and at the end ``summary.csv``, ``posteriors.nc`` and, after failures, ``failed.csv``. None: nothing is
+            stored.
         workers: 1: this process; more: the number of processes on this machine; ``"tcp://host:port"``: the workers of a
             Dask scheduler. A script that starts processes needs ``if __name__ == "__main__":``.
         seed: seed of all random numbers.
@@ -247,8 +248,8 @@ def fit_many(
         if name in tasks:
             raise ValueError(f"two data sets are called {name!r}; give every one a name of its own.")
         tasks[name] = fit_task(compute.model, name, value, {**options, **each.get(name, {})}, seed, digests)
-    return ManyFits(compute, tasks, None if out is None else Path(out), workers=workers, overwrite=overwrite,
-                    report=(report or Console()) if progress else None)
+    return ManyFits(compute, tasks, None if checkpoint is None else Path(checkpoint), workers=workers,
+                    overwrite=overwrite, report=(report or Console()) if progress else None)
 
 
 def _check_options(label: str, options: Mapping[str, Any], accepted: list[str]) -> None:

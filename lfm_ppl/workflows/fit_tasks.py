@@ -73,7 +73,7 @@ def _model_digest(model: Callable, times: np.ndarray, y: np.ndarray, keywords: A
     if key in digests:
         return digests[key]
     try:
-        bound = bind(model, times, y, **dict(keywords or {}))
+        bound = bind(model, times, y, model_kwargs=keywords)
         value = model_digest(bound)
     except Exception:  # raised again by the fit of this data set
         return "none"

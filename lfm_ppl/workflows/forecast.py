@@ -54,7 +54,7 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
 
     Args:
         result: of `lfm_ppl.fit`, or read by `lfm_ppl.load`; also one series or one likelihood site of it, from
-            `lfm_ppl.select_series` or `lfm_ppl.select_site`, which is predicted alone.
+            `lfm_ppl.select_series`, which is predicted alone.
         numpyro_model: the model that was fitted, of all series and sites. A result holds draws and data, but no code.
         times: (K,) times of the forecast, non-decreasing, from the initial time on; dates if the data have dates.
             (B, K) where the series of a panel have times of their own. With several likelihood sites for all of them,
@@ -84,7 +84,7 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
         their normal distribution at each draw; and ``outputs``, which are noise-free, ``forces``, ``states`` and
         ``deterministics`` along the same paths. `lfm_ppl.score` compares them with data, `lfm_ppl.plot_fit` and
         `lfm_ppl.plot_forces` draw them. Known ``inputs`` are a group ``predictions_constant_data``. With several
-        likelihood sites the groups have the names of the sites, see `lfm_ppl.select_site`.
+        likelihood sites the groups have the names of the sites, see `lfm_ppl.select_series`.
 
     Raises:
         ValueError: times that go back or lie before the initial time; another model than that of the result, seen by

@@ -105,7 +105,7 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: ArrayLike, y: ArrayLike,
         checks.positive_integer("trajectory_draws", trajectory_draws)
     draws, stats = _collected(mcmc)
     values = np.asarray(y.to_numpy(), float) if hasattr(y, "to_numpy") else y  # a data frame
-    bound = bind(numpyro_model, times, values, **dict(model_kwargs or {}))
+    bound = bind(numpyro_model, times, values, model_kwargs=model_kwargs)
     draws = _checked(bound, draws)
     chains, samples = next(iter(draws.values())).shape[:2]
     flat = {site: draws[site].reshape(-1, *draws[site].shape[2:]) for site in bound.sites}

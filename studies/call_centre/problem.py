@@ -136,7 +136,7 @@ def posterior(arrival_model: ArrivalModel) -> LogPosterior:
     """Return the posterior of z as a function of the training readings (63, 1), compiled once for all windows."""
     with jax.ensure_compile_time_eval():
         bound = lfm.bind(model_file().model, TRAINING_TIMES, np.zeros((len(TRAINING_TIMES), 1)),
-                         **arrival_model._asdict())
+                         model_kwargs=arrival_model._asdict())
         return LogPosterior(bound, arrival_model.names, forward_mode=False)
 
 

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import lfm_ppl as lfm
+from lfm_ppl.model.state_space import state_space
 from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.switching.mixture import Mixture
 from lfm_ppl.utils.linalg import congruence, matmul
@@ -76,7 +77,7 @@ def track(arrival_model: ArrivalModel, z: Any, y: Any, test_rates: Any, is_smoot
     model = problem.build_model(arrival_model, z, jnp.array(test_rates))
     path: Any = (lfm.smooth if is_smoothed else lfm.filter)(model, GRID, y, steps=STEPS)
     states = (path.mean, path.covariance) if is_smoothed else (path.filtered_mean, path.filtered_covariance)
-    ssm = lfm.state_space(model)
+    ssm = state_space(model)
 
     def queue_and_arrivals(t: jax.Array, m: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
         matrix, offset = ssm.input_map(t)

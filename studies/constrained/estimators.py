@@ -117,12 +117,12 @@ def _without_band(estimate: jax.Array, converged: Any = True) -> tuple[jax.Array
 
 def _estimate_by_full_information(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     estimate = lfm.full_information(problem.transcription(*values), TIMES, y, lower={FACTOR: 0.0}, grid=TIMES)
-    return _without_band(estimate.force(FACTOR), estimate.converged)
+    return _without_band(estimate.force(FACTOR).mean, estimate.converged)
 
 
 def _estimate_by_cost(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     estimate = _minimise_cost(values, jnp.zeros(3), y)
-    return _without_band(estimate.state(FACTOR), estimate.converged)
+    return _without_band(estimate.state(FACTOR).mean, estimate.converged)
 
 
 def _minimise_cost(values: jax.Array, mean: Any, y: jax.Array) -> ConstrainedEstimate:
@@ -288,7 +288,7 @@ def _estimate_patient(z: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
     model = posterior.likelihood(z, y).model
     lower = dict.fromkeys((*model.state_names, HORMONE), 0.0)
     estimate = lfm.full_information(model, posterior.bound.times, y, lower=lower, steps=2)
-    return {"times": estimate.times, "mode": estimate.force(HORMONE), "converged": estimate.converged,
+    return {"times": estimate.times, "mode": estimate.force(HORMONE).mean, "converged": estimate.converged,
             "lowest": jnp.minimum(estimate.state_mean.min(), estimate.force_mean.min())}
 
 

@@ -19,6 +19,7 @@ from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.kernels.elliptical_slice import SliceState, elliptical_slice_step
 from lfm_ppl.latent_grid.latent_grid import JITTER
+from lfm_ppl.model.state_space import state_space
 
 CHAINS = 4
 
@@ -43,7 +44,7 @@ class MonteCarloReference:
 
     def __init__(self, model: lfm.LatentForceModel, times: np.ndarray, factors: lfm.FactorSettings) -> None:
         assert isinstance(model.observation, lfm.ObservationFamily)
-        self.ssm, self.times, self.settings, self.family = lfm.state_space(model), times, factors, model.observation
+        self.ssm, self.times, self.settings, self.family = state_space(model), times, factors, model.observation
         t, zero_forces = jnp.asarray(times), jnp.zeros(len(model.force_names))
         self.mean = model.observation.function(jnp.zeros(0), zero_forces, t[0])[0]
         covariance: Any = sum(force.covariance_in_model(t[:, None], t, t[0]) for force in self.ssm.stack.forces)

@@ -23,6 +23,7 @@ import xarray as xr
 import lfm_ppl as lfm
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import grid_filter
+from lfm_ppl.model.state_space import state_space
 from lfm_ppl.parallel.task import Result, Task
 from lfm_ppl.particles import particle_filter
 
@@ -93,7 +94,7 @@ def _compile_likelihoods(method: str, size: int, steps: int, times: tuple[float,
         if method in problem.GAUSSIAN:
             return lfm.MarginalLikelihood(system, np.array(times), problem.GAUSSIAN[method], steps=steps,
                                           iterations=0).log_prob(y)
-        ssm = lfm.state_space(system)
+        ssm = state_space(system)
         time_grid = build_time_grid(ssm, np.array(times), steps)
         if method == problem.GRID:
             return grid_filter.log_likelihood(ssm, time_grid, y, states.build_grid(size))

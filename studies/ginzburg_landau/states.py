@@ -21,6 +21,7 @@ import lfm_ppl as lfm
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid import grid_filter
 from lfm_ppl.fokker_planck_grid.finite_volume import Grid
+from lfm_ppl.model.state_space import state_space
 from lfm_ppl.parallel.task import Result, Task
 
 from .. import scores
@@ -92,7 +93,7 @@ def solve(method: str, theta: jax.Array, sparse: jax.Array, fine: np.ndarray, si
         smoothed = lfm.smooth(system, fine, sparse, problem.GAUSSIAN[method], size, iterations=0)
         return (smoothed.log_likelihood.sum(), (filtered.filtered_mean[:, 0], filtered.filtered_covariance[:, 0, 0]),
                 (smoothed.mean[:, 0], smoothed.covariance[:, 0, 0]), ())
-    ssm, cells = lfm.state_space(system), build_grid(size)
+    ssm, cells = state_space(system), build_grid(size)
     time_grid = build_time_grid(ssm, fine, 1)
     transition = grid_filter.build_transition(grid_filter.on_grid(ssm, time_grid, cells), time_grid, 1)
     forward = grid_filter.forward(transition, time_grid, sparse[None], keep_masses=True)

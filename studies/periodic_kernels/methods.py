@@ -11,6 +11,7 @@ from scipy.stats import norm
 
 from lfm_ppl import forces
 from lfm_ppl.forces import Force, PeriodicCovariance
+from lfm_ppl.forces.quasi_periodic import significant_functions
 from lfm_ppl.parallel.task import Result, Task
 
 from .. import scores
@@ -54,7 +55,7 @@ def covariance_errors(task: Task) -> Result:
             row[RANDOM] = _random_frequency_errors(np.reshape(frequencies, (draws, size)), times, exact).mean()
         return row
 
-    significant = forces.significant_functions(kernel)
+    significant = significant_functions(kernel)
     return stack_results([errors(feasible_count(kernel, count)) for count in task.settings["functions"]]) | {
         "significant": significant, "at default": covariance_error(eigenfunctions(kernel, significant), times, exact)}
 

@@ -14,7 +14,9 @@ import pytest
 
 from lfm_ppl import cli
 from lfm_ppl.cli import choices, folders, main
+from lfm_ppl.filtering.iterated import DEFAULT_ITERATIONS
 from lfm_ppl.io import loading
+from lfm_ppl.likelihoods.filter_settings import FilterSettings
 from lfm_ppl.results import arviz_data
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.studies import catalogue
@@ -47,6 +49,16 @@ for line in (["--help"], ["fit", "--help"], ["compare", "--help"]):
 assert not {"jax", "numpy", "pandas", "matplotlib"} & set(sys.modules)
 """
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=ROOT)
+
+
+def test_the_help_shows_the_defaults_of_the_likelihood(run):
+    text = " ".join(run("fit --help")[1].split())
+    settings = FilterSettings()
+    defaults = {"rule": type(settings.rule).__name__.lower(), "steps": settings.steps, "method": settings.method,
+                "iterations": DEFAULT_ITERATIONS}
+    for name, default in defaults.items():
+        _, description = re.split(rf"--{name} [A-Z]", text, maxsplit=1)
+        assert f"(default: {default}" in description.partition(" --")[0], name
 
 
 def test_options_and_commands_that_the_pages_name_exist(run):

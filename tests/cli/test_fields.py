@@ -22,7 +22,7 @@ def source(parameters):
 
 def model(times, y=None):
     scale = numpyro.sample("scale", dist.LogNormal(0.0, 0.5))
-    system = lfm.heat(source({"scale": scale}), 0.1, 0.1, sensors=SENSORS, noise=0.1, output_names=("a", "b"))
+    system = lfm.heat(source({"scale": scale}), 0.1, 0.1, sensors=SENSORS, covariance=0.1, output_names=("a", "b"))
     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
 

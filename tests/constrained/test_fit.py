@@ -92,7 +92,7 @@ def test_the_error_of_an_evidence_is_that_of_its_logarithm_over_many_sets_of_wei
 @pytest.mark.slow
 def test_unconverged_factors_and_light_weights_are_counted():
     """The weights of 2 trajectories are worth at most 2; factors converge nowhere at a lengthscale of NaN."""
-    bound = lfm.bind(bounded, TIMES, Y, draws=2, grid=TIMES)
+    bound = lfm.bind(bounded, TIMES, Y, model_kwargs={"draws": 2, "grid": TIMES})
     values = {"lengthscale": np.array([0.5, 1.0, np.nan, 2.0])}
     assert failures_at(bound, values) == (4, 1, 1)
     worth = path_ess(bound, {"lengthscale": np.array([0.5, 1.0, 2.0])})

@@ -65,8 +65,9 @@ def test_without_active_constraints_it_is_the_smoother():
     loose = lfm.full_information(MODEL, TIMES, y, lower={"factor": -10.0}, upper={"x0": 5.0, "factor": 9.0}, grid=TIMES)
     for estimate in (free, loose):
         assert estimate.converged and estimate.passes == 1 and estimate.gap == 0.0 and not estimate.multiplier.any()
-        np.testing.assert_allclose(estimate.force("factor"), smoothed.force("factor").mean, atol=1e-10)
-        np.testing.assert_allclose(estimate.state("x0"), smoothed.state("x0").mean, atol=1e-10)
+        np.testing.assert_allclose(estimate.force("factor").mean, smoothed.force("factor").mean, atol=1e-10)
+        np.testing.assert_allclose(estimate.state("x0").mean, smoothed.state("x0").mean, atol=1e-10)
+    assert type(loose.force("factor")) is type(smoothed.force("factor")) and np.isnan(loose.state("x0").sd).all()
     np.testing.assert_allclose(loose.slack[:, 0], smoothed.force("factor").mean + 10.0, atol=1e-10)
 
 
@@ -82,8 +83,8 @@ def test_with_active_constraints_it_is_the_dense_quadratic_program(bounded):
     assert estimate.converged and estimate.gap <= 1e-10
     active = np.asarray(estimate.active)
     assert (active.sum(axis=0) >= [3, 3, 0]).all()
-    np.testing.assert_allclose(estimate.state("x0"), w[0::2], atol=1e-6)
-    np.testing.assert_allclose(estimate.force("factor"), w[1::2], atol=1e-6)
+    np.testing.assert_allclose(estimate.state("x0").mean, w[0::2], atol=1e-6)
+    np.testing.assert_allclose(estimate.force("factor").mean, w[1::2], atol=1e-6)
     np.testing.assert_allclose(np.asarray(estimate.multiplier).T.ravel(), multipliers, atol=1e-5 * multipliers.max())
     free = lfm.full_information(MODEL, TIMES, y, grid=TIMES)
     assert np.isclose(estimate.objective - free.objective, excess, rtol=1e-7)
@@ -111,7 +112,7 @@ def test_outputs_and_functions_are_bounded_like_names(bounded):
 def test_bounds_may_change_with_time():
     estimate = lfm.full_information(MODEL, TIMES, data(1), grid=TIMES,
                                     constraints=[lambda x, u, t: u[0] + 0.2 * t, lambda x, u, t: 1.0 - u])
-    assert estimate.converged and (estimate.force("factor") >= -0.2 * TIMES - 1e-9).all()
+    assert estimate.converged and (estimate.force("factor").mean >= -0.2 * TIMES - 1e-9).all()
 
 
 @pytest.mark.slow
@@ -140,7 +141,7 @@ def test_replicates_and_missing_rows():
 def test_a_known_start_on_its_bound():
     model = transcription(variance=0.0)
     estimate = lfm.full_information(model, TIMES, data(2), lower={"x0": 0.0, "factor": 0.0}, grid=TIMES)
-    assert estimate.converged and estimate.state("x0")[0] == 0.0 and estimate.state_mean.min() >= 0.0
+    assert estimate.converged and estimate.state("x0").mean[0] == 0.0 and estimate.state_mean.min() >= 0.0
 
 
 def test_another_data_set_and_other_bounds_compile_nothing(bounded, caplog):
@@ -186,7 +187,7 @@ def test_ballistic_target_against_ipopt():
         guess = np.concatenate([estimate.state_mean, estimate.force_mean, np.zeros((26, 2))], axis=1)
         nodes, objective = reference.solve(times, np.asarray(y), guess + 0.01)
         assert np.isclose(estimate.objective, objective, rtol=0, atol=1e-4)
-        np.testing.assert_allclose(estimate.force("u"), nodes[:, 2], atol=1e-5)
+        np.testing.assert_allclose(estimate.force("u").mean, nodes[:, 2], atol=1e-5)
         np.testing.assert_allclose(estimate.state_mean, nodes[:, :2], atol=1e-4)
 
 

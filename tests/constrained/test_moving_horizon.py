@@ -28,7 +28,7 @@ MODEL = linear()
 
 
 def test_without_constraints_it_is_the_kalman_filter():
-    estimate = lfm.moving_horizon(MODEL, TIMES, Y, window=WINDOW, delay=0)
+    estimate = lfm.MovingHorizon(MODEL, window=WINDOW, delay=0).estimate(TIMES, Y)
     filtered = lfm.filter(MODEL, TIMES, Y)
     rows = slice(WINDOW - 1, None)
     np.testing.assert_allclose(estimate.state_mean[rows, 0], filtered.filtered_mean[rows, 0], atol=1e-9)
@@ -37,7 +37,7 @@ def test_without_constraints_it_is_the_kalman_filter():
 
 @pytest.mark.slow
 def test_with_a_delay_it_is_the_fixed_lag_smoother():
-    estimate = lfm.moving_horizon(MODEL, TIMES, Y, window=WINDOW, delay=2)
+    estimate = lfm.MovingHorizon(MODEL, window=WINDOW, delay=2).estimate(TIMES, Y)
     for last in (WINDOW - 1, 8, 11):
         y = np.where(np.arange(12)[:, None] <= last, Y, np.nan)
         smoothed = lfm.smooth(MODEL, TIMES, y)
@@ -49,7 +49,7 @@ def test_with_a_delay_it_is_the_fixed_lag_smoother():
 @pytest.mark.parametrize("delay", [0, 6])
 def test_a_window_that_holds_everything_is_full_information(delay):
     full = lfm.full_information(MODEL, TIMES, Y, lower={"factor": 0.0}, grid=np.unique(TIMES))
-    estimate = lfm.moving_horizon(MODEL, TIMES, Y, window=12, delay=delay, lower={"factor": 0.0})
+    estimate = lfm.MovingHorizon(MODEL, window=12, delay=delay, lower={"factor": 0.0}).estimate(TIMES, Y)
     assert estimate.converged and np.asarray(full.active).any()
     distinct = np.r_[0:5, 6:12]
     np.testing.assert_allclose(estimate.force_mean[distinct], full.force_mean, atol=1e-7)
@@ -59,7 +59,7 @@ def test_a_window_that_holds_everything_is_full_information(delay):
 def test_one_observation_at_a_time(tmp_path, caplog):
     """The same as the record at once, from a saved state too; nothing is compiled after the second call."""
     horizon = lfm.MovingHorizon(MODEL, window=WINDOW, delay=2, lower={"factor": 0.0})
-    record = lfm.moving_horizon(MODEL, TIMES, Y, window=WINDOW, delay=2, lower={"factor": 0.0})
+    record = horizon.estimate(TIMES, Y)
     state, estimates = horizon.start(), []
     for index, (t, y) in enumerate(zip(TIMES, Y, strict=True)):
         if index == 2:
@@ -89,9 +89,9 @@ def test_a_model_that_bends():
     times = np.linspace(0.5, 5.0, 10)
     y = lfm.simulate(jax.random.key(2), model, times).y
     full = lfm.full_information(model, times, y, lower={"u": -0.3}, grid=times, steps=2)
-    longest_window = lfm.moving_horizon(model, times, y, window=10, lower={"u": -0.3}, steps=2)
+    longest_window = lfm.MovingHorizon(model, window=10, lower={"u": -0.3}, steps=2).estimate(times, y)
     np.testing.assert_allclose(longest_window.force_mean, full.force_mean, atol=1e-5)
-    short_window = lfm.moving_horizon(model, times, y, window=6, lower={"u": -0.3}, steps=2)
+    short_window = lfm.MovingHorizon(model, window=6, lower={"u": -0.3}, steps=2).estimate(times, y)
     assert short_window.converged and short_window.force_mean.min() >= -0.3
     assert np.abs(short_window.force_mean - full.force_mean).max() < 0.5
 
@@ -100,7 +100,7 @@ def test_bad_windows_and_observations_are_named():
     for arguments, name in (({"window": 13}, "13"), ({"window": 1}, "window"), ({"window": 5, "delay": 5}, "delay"),
                             ({"window": 5, "delay": -1}, "delay"), ({"window": 5, "lower": {"u": 0.0}}, "'u'")):
         with pytest.raises(ValueError, match=name):
-            lfm.moving_horizon(MODEL, TIMES, Y, **arguments)
+            lfm.MovingHorizon(MODEL, **arguments).estimate(TIMES, Y)
     horizon = lfm.MovingHorizon(MODEL, window=WINDOW)
     for t, y, name in ((0.0, [0.0, 1.0], r"\(2,\)"), (-1.0, [0.0], "-1")):
         with pytest.raises(ValueError, match=name):

@@ -77,6 +77,10 @@ def test_without_active_constraints_it_is_the_smoother():
     smoothed = lfm.smooth(model(), TIMES, Y)
     np.testing.assert_allclose(posterior.force_mean[:, 0], smoothed.force("factor").mean, atol=1e-8)
     np.testing.assert_allclose(posterior.force_sd[:, 0], smoothed.force("factor").sd, atol=1e-8)
+    for of_posterior, expected in ((posterior.force("factor"), smoothed.force("factor")),
+                                   (posterior.state("x0"), smoothed.state("x0"))):
+        assert type(of_posterior) is type(expected)
+        np.testing.assert_allclose(of_posterior, expected, atol=1e-8)
     low, high = posterior.interval("x0")
     sd = smoothed.state("x0").sd
     np.testing.assert_allclose(low, smoothed.state("x0").mean + norm.ppf(0.025) * sd, atol=1e-8)

@@ -15,6 +15,7 @@ from systems import DoubleWell, Linear, Outputs, double_well, identity, motif, w
 import lfm_ppl as lfm
 from lfm_ppl.filtering.breakdown import breakdown
 from lfm_ppl.filtering.time_grid import build_time_grid
+from lfm_ppl.model.state_space import state_space
 
 TIMES = np.array([0.5, 1.0, 9.0, 9.5])
 Y = np.array([0.4, 0.6, 0.5, 0.1])[:, None]
@@ -60,7 +61,7 @@ def test_two_outputs_that_contradict_each_other():
 
 
 def test_nothing_is_said_where_nothing_breaks_down():
-    ssm = lfm.state_space(double_well())
+    ssm = state_space(double_well())
     assert breakdown(ssm, lfm.Cubature(), build_time_grid(ssm, TIMES, 10), Y) is None
 
 

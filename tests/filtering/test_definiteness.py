@@ -18,6 +18,7 @@ from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.smoothing_kernel import smoothing_kernel
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
+from lfm_ppl.model.state_space import state_space
 
 TIMES = np.array([0.0, 0.01, 0.5, 0.5, 1.2, 2.0])
 Y = np.array([0.4, 0.40002, 0.43, 0.43, np.nan, 0.3])[:, None]
@@ -43,7 +44,7 @@ def passes(model, variance, noise):
     """All covariances that occur: predicted, filtered, smoothed."""
     model = eqx.tree_at(lambda m: (m.initial_state.covariance, m.observation.covariance), model,
                         (variance * jnp.eye(len(model.state_names)), noise * jnp.ones(1)))
-    ssm = lfm.state_space(model)
+    ssm = state_space(model)
     grid = build_time_grid(ssm, TIMES, 1)
     problem = filter_problem(ssm, lfm.Cubature(), grid)
     trace = forward(problem, GaussianUpdate(jnp.asarray(Y)), record=Record.SMOOTHER)

@@ -175,7 +175,7 @@ def all_families(theta):
         lfm.PoissonObservation(state), lfm.NegativeBinomialObservation(state, 5.0 * noise),
         lfm.BernoulliObservation(lambda x, u, t: x - 4.0), lfm.BinomialObservation(lambda x, u, t: x - 4.0, 10.0),
         lfm.CensoredObservation(state, noise, left=4.0), lfm.StudentTObservation(state, 4.0, noise),
-        lfm.Observation(lambda x, u, t: x - 4.0, lambda f: dist.Gamma(2.0, jnp.exp(f))),
+        lfm.DistributionObservation(lambda x, u, t: x - 4.0, lambda f: dist.Gamma(2.0, jnp.exp(f))),
         lfm.GaussianObservation(state, noise[None] ** 2))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from scipy import special, stats
 from scipy.integrate import solve_ivp
 
 import lfm_ppl as lfm
@@ -340,3 +341,38 @@ def test_wrong_arguments_of_events_are_refused():
         lfm.Reset([1.0], 0)
     with pytest.raises(TypeError, match=r"lfm\.Dose"):
         absorption(1.0, 0.5, [(1.0, 2.0)])
+
+
+@pytest.mark.parametrize("negative_binomial", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_counts_of_a_state_that_is_zero_at_a_row(negative_binomial):
+    """The integral of an unknown constant rate, from zero at the first row on: log evidence and gradient by quadrature.
+
+    The count at rate zero is zero with probability one, and any other count is impossible there.
+    """
+    times, counts = np.array([0.0, 1.0, 2.0, 4.0, 5.0]), np.array([0.0, 2.0, 5.0, 7.0, 1.0])
+    gaps = np.diff(times, prepend=0.0)
+
+    def family(function):
+        return (lfm.NegativeBinomialObservation(function, 3.0, "identity") if negative_binomial
+                else lfm.PoissonObservation(function, "identity"))
+
+    def log_density(mean, y=counts):
+        model = lfm.LatentForceModel(
+            lambda x, u, t: u, {"rate": lfm.Constant(0.5, mean=mean)}, family(lambda x, u, t: x),
+            lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))), initial_time=0.0, state_names=("n",),
+            events=[lfm.Reset(times, "n")])
+        return lfm.MarginalLikelihood(model, times).log_prob(jnp.asarray(y)[:, None])
+
+    def exact(mean):
+        rate = np.linspace(1e-9, 8.0, 4001)
+        log_terms = stats.norm.logpdf(rate, mean, 0.5) + np.log(rate[1] - rate[0])
+        for count, gap in zip(counts[1:], gaps[1:], strict=True):
+            log_terms += (stats.nbinom.logpmf(count, 3.0, 3.0 / (3.0 + gap * rate)) if negative_binomial
+                          else stats.poisson.logpmf(count, gap * rate))
+        return special.logsumexp(log_terms)
+
+    value, gradient = jax.jit(jax.value_and_grad(log_density))(3.0)
+    assert float(value) == pytest.approx(exact(3.0), abs=2e-3)
+    assert float(gradient) == pytest.approx((exact(3.001) - exact(2.999)) / 0.002, abs=5e-3)
+    with pytest.warns(lfm.FilterWarning, match="predictor 0"):
+        assert log_density(3.0, [1.0, *counts[1:]]) == -np.inf

@@ -447,7 +447,7 @@ def test_a_gap_leaves_the_gradient_of_a_bounded_law_alone():
     times, y = np.arange(4.0), np.array([[0.4], [np.nan], [0.7], [0.2]])
 
     def evidence(level):
-        observation = lfm.Observation(lambda x, u, t: u + level, lambda f: dist.TransformedDistribution(
+        observation = lfm.DistributionObservation(lambda x, u, t: u + level, lambda f: dist.TransformedDistribution(
             dist.Normal(f, 0.7), dist.transforms.SigmoidTransform()))  # no density at 1
         return lfm.MarginalLikelihood(process(observation), times).log_prob(y)
 

@@ -15,20 +15,20 @@ from lfm_ppl.filtering.integrators.methods import METHODS, choose_integrator
 from lfm_ppl.filtering.integrators.runge_kutta import RungeKutta
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.transition import linear_part
-from lfm_ppl.model.state_space import Span
+from lfm_ppl.model.state_space import Span, state_space
 
 LENGTH = 0.8
 
 
-def state_space(dynamics, noise=None):
-    return lfm.state_space(lfm.LatentForceModel(
+def ssm_of(dynamics, noise=None):
+    return state_space(lfm.LatentForceModel(
         dynamics, {"u": lfm.Matern(1.0, 1.5, order=1)}, lfm.GaussianObservation(whole_state, jnp.ones(2)),
         lfm.Gaussian(jnp.array([0.5, -0.2]), jnp.array([[0.2, 0.05], [0.05, 0.1]])), process_noise=noise))
 
 
-CUBIC = state_space(lambda x, u, t: jnp.stack([x[1], u[0] - x[0] - 0.5 * x[0]**3 - 0.3 * x[1] + jnp.cos(t)]),
+CUBIC = ssm_of(lambda x, u, t: jnp.stack([x[1], u[0] - x[0] - 0.5 * x[0]**3 - 0.3 * x[1] + jnp.cos(t)]),
                     0.2 * jnp.eye(2))
-LINEAR = state_space(lambda x, u, t: jnp.stack([x[1], u[0] - x[0] - 0.3 * x[1]]), 0.2 * jnp.eye(2))
+LINEAR = ssm_of(lambda x, u, t: jnp.stack([x[1], u[0] - x[0] - 0.3 * x[1]]), 0.2 * jnp.eye(2))
 
 
 def predict(integrator, ssm, steps, record=Record.SMOOTHER):

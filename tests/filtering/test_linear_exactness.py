@@ -14,6 +14,7 @@ from references import LinearLFM, Regression, added, complex_step, matern
 from systems import Linear, Outputs
 
 import lfm_ppl as lfm
+from lfm_ppl.model.state_space import state_space
 
 NAN = np.nan
 
@@ -180,7 +181,7 @@ def test_filter(name):
     case = CASES[name]()
     result = lfm.filter(case.model, case.times, case.y, steps=case.steps)
     mean, covariance = case.reference.filtered(case.times, case.y)
-    ssm = lfm.state_space(case.model)
+    ssm = state_space(case.model)
     matrix, offset = jax.vmap(ssm.input_map)(jnp.asarray(case.times))
     close(jnp.einsum("kwn,kn->kw", matrix, result.filtered_mean) + offset, mean)
     close(jnp.einsum("kwn,knm,kvm->kwv", matrix, result.filtered_covariance, matrix), covariance)

@@ -15,7 +15,7 @@ from lfm_ppl.filtering.integrators.quadrature import Quadrature
 from lfm_ppl.filtering.integrators.runge_kutta import RungeKutta
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.transition import linear_part
-from lfm_ppl.model.state_space import Span
+from lfm_ppl.model.state_space import Span, state_space
 
 DECAY = jnp.array([0.4, 0.9, 0.6])
 SENSITIVITY = jnp.array([1.0, 0.5, 0.7])
@@ -56,7 +56,7 @@ RULES = {"cubature": lfm.Cubature(), "taylor": lfm.Taylor()}
 def case(name):
     dynamics, genes, link, count, noise = CASES[name]
     forces = {"first": lfm.Matern(1.0, 1.5, order=1), "second": lfm.Matern(0.7, 0.8, order=0)}
-    return lfm.state_space(lfm.LatentForceModel(
+    return state_space(lfm.LatentForceModel(
         dynamics(genes, link), dict(list(forces.items())[:count]),
         lfm.GaussianObservation(whole_state, 0.01 * jnp.ones(genes)),
         lfm.Gaussian(jnp.ones(genes), jnp.zeros((genes, genes))), process_noise=noise))
@@ -124,7 +124,7 @@ def test_other_structures_keep_runge_kutta(dynamics):
     model = lfm.LatentForceModel(dynamics, {"u": lfm.Matern(1.0, 1.0)},
                                  lfm.GaussianObservation(whole_state, jnp.ones(1)),
                                  lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
-    assert integrator_of(lfm.state_space(model)) == RungeKutta()
+    assert integrator_of(state_space(model)) == RungeKutta()
 
 
 def test_points_in_the_whole_state_keep_runge_kutta():
@@ -133,7 +133,7 @@ def test_points_in_the_whole_state_keep_runge_kutta():
                                  lfm.GaussianObservation(whole_state, jnp.ones(1)),
                                  lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
                                  process_noise=lambda x, u, t: x[None])
-    assert integrator_of(lfm.state_space(noisy)) == RungeKutta()
+    assert integrator_of(state_space(noisy)) == RungeKutta()
 
 
 @pytest.mark.slow
@@ -142,7 +142,7 @@ def test_without_forces():
     model = lfm.LatentForceModel(
         lambda x, u, t: jnp.cos(t) - x, {}, lfm.GaussianObservation(whole_state, jnp.array([0.1])),
         lfm.Gaussian(jnp.ones(1), jnp.eye(1)), process_noise=lambda x, u, t: (1.0 + t) * jnp.ones((1, 1)))
-    assert integrator_of(lfm.state_space(model)) == ExactTransition()
+    assert integrator_of(state_space(model)) == ExactTransition()
     once, twice = (lfm.MarginalLikelihood(model, np.arange(4.0), steps=3, iterations=count).log_prob(jnp.ones((4, 1)))
                    for count in (0, 2))
     np.testing.assert_allclose(once, twice, rtol=1e-12)

@@ -40,7 +40,7 @@ def test_the_longest_step_is_at_most_twice_the_median_step():
 
 def test_pauses_between_bursts_take_a_bounded_number_of_steps():
     bursts = (np.arange(10.0)[:, None] + 1e-6 * np.arange(50)).ravel()
-    grid = build_time_grid(lfm.state_space(system()), bursts, 10)
+    grid = build_time_grid(state_space(system()), bursts, 10)
     assert len(np.asarray(grid.intervals.length)) < 22 * len(bursts)
 
 

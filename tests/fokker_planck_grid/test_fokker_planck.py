@@ -12,6 +12,7 @@ import lfm_ppl as lfm
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.fokker_planck_grid.fokker_planck import Grid, choose_grid, fokker_planck, log_likelihood
 from lfm_ppl.forces import Force
+from lfm_ppl.model.state_space import state_space
 
 TIMES = np.array([0.1, 0.45, 0.45, 0.8, 1.5, 1.7, 2.9, 3.0, 4.2])
 AT = np.array([3.5, 0.0, 0.45, 1.1, 5.0])
@@ -121,7 +122,7 @@ WELL_Y = np.array([0.7, 1.1, np.nan, -0.2, -0.9, -0.6])[:, None]
 
 @pytest.mark.slow
 def test_second_order_in_the_width_of_a_cell():
-    ssm = lfm.state_space(WELL)
+    ssm = state_space(WELL)
     time_grid = build_time_grid(ssm, WELL_TIMES, 1)
     value = {n: float(log_likelihood(ssm, time_grid, WELL_Y, Grid(-2.5, 2.5, n))) for n in (50, 100, 200, 800)}
     errors = [abs(value[n] - value[800]) for n in (50, 100, 200)]
@@ -213,7 +214,7 @@ def test_a_likelihood_as_narrow_as_a_cell_is_integrated():
     grid = Grid(-5.0, 5.0, 100)
     for sd in (0.05, 0.025):
         model = ornstein_uhlenbeck(noise=sd**2, variance=1.0)
-        ssm = lfm.state_space(model)
+        ssm = state_space(model)
         for y in (0.0, 0.05, 0.13):
             value = log_likelihood(ssm, build_time_grid(ssm, [0.0], 1), [[y]], grid)
             exact = -0.5 * (y - 0.5) ** 2 / (1.0 + sd**2) - 0.5 * np.log(2 * np.pi * (1.0 + sd**2))
@@ -241,12 +242,12 @@ def parameters(theta):
 @pytest.mark.slow
 @pytest.mark.parametrize("times", [WELL_TIMES, WELL_TIMES**1.1], ids=["equal intervals", "any intervals"])
 def test_batches_and_vmap_equal_loops(times):
-    ssm, grid = lfm.state_space(WELL), Grid(-3.0, 3.0, 60)
+    ssm, grid = state_space(WELL), Grid(-3.0, 3.0, 60)
     time_grid = build_time_grid(ssm, times, 1)
     sets = np.stack([WELL_Y, WELL_Y[::-1], 0.5 * WELL_Y])
     run = jax.jit(lambda y: log_likelihood(ssm, time_grid, y, grid))
     np.testing.assert_allclose(run(sets), [run(y) for y in sets], rtol=1e-12)
-    log_density = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid,
+    log_density = jax.jit(lambda theta: log_likelihood(state_space(parameters(theta)), time_grid,
                                                        jnp.asarray(WELL_Y), grid))
     thetas = jnp.array([[1.5, 0.8, 0.04], [0.7, 1.1, 0.04], [2.0, 0.3, 0.04]])
     loop = [log_density(theta) for theta in thetas]
@@ -256,9 +257,9 @@ def test_batches_and_vmap_equal_loops(times):
 
 def test_derivatives_in_forward_mode_and_failure():
     """Failure in compiled code is minus infinity."""
-    ssm, grid = lfm.state_space(WELL), Grid(-3.0, 3.0, 60)
+    ssm, grid = state_space(WELL), Grid(-3.0, 3.0, 60)
     time_grid = build_time_grid(ssm, WELL_TIMES, 1)
-    log_density = jax.jit(lambda theta: log_likelihood(lfm.state_space(parameters(theta)), time_grid,
+    log_density = jax.jit(lambda theta: log_likelihood(state_space(parameters(theta)), time_grid,
                                                        jnp.asarray(WELL_Y), grid))
     theta = jnp.array([1.5, 0.8, 0.04])
     slope = jax.jit(jax.jacfwd(log_density))(theta)
@@ -273,7 +274,7 @@ def test_derivatives_in_forward_mode_and_failure():
 def test_the_chosen_grid_is_as_accurate_as_asked():
     tolerance = 2e-3
     grid = choose_grid(WELL, WELL_TIMES, WELL_Y, tolerance=tolerance)
-    ssm = lfm.state_space(WELL)
+    ssm = state_space(WELL)
     time_grid = build_time_grid(ssm, WELL_TIMES, 1)
     wide = Grid(grid.low - 0.5, grid.high + 0.5, int(3 * grid.cells * (1 + 1 / (grid.high - grid.low))))
     value, better = (float(log_likelihood(ssm, time_grid, WELL_Y, g)) for g in (grid, wide))

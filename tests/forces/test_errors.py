@@ -22,7 +22,7 @@ VALUES = [
     (lambda: jax.jit(lambda ell: Matern(1.0, ell).feedback())(jnp.ones(3)), "lengthscale"),
     (lambda: Matern(1.0, 1.0, order=6), "order"),
     (lambda: SquaredExponential(1.0, 1.0, order=3), "order"),
-    (lambda: WienerVelocity(1.0, initial_value_sd=-1.0), "initial_value_sd"),
+    (lambda: WienerVelocity(1.0, initial_sd=-1.0), "initial_sd"),
     (lambda: WienerVelocity(1.0, initial_velocity_sd=np.nan), "initial_velocity_sd"),
     (lambda: Constant(1.0, mean=np.nan), "mean"),
     (lambda: Matern(1.0, 1.0, mean=[1.0, 2.0]), "mean"),

@@ -14,6 +14,7 @@ import lfm_ppl as lfm
 from lfm_ppl import forces
 from lfm_ppl.forces.basis import fourier_coefficients
 from lfm_ppl.forces.eigenspace import leading_eigenvectors
+from lfm_ppl.forces.quasi_periodic import significant_functions
 from lfm_ppl.studies.periodic_kernels.resonators import resonators
 from lfm_ppl.studies.periodic_kernels.sparse_spectrum import SparseSpectrum, random_frequencies
 
@@ -86,7 +87,7 @@ def test_the_default_is_as_good_as_documented(order, largest):
         matern = None if order == "se" else forces.PeriodicMatern(1.0, lengthscale, 10.0, order)
         kernel = matern or squared_exponential(lengthscale)
         force = lfm.Periodic(kernel)
-        assert force.functions == forces.significant_functions(kernel)
+        assert force.functions == significant_functions(kernel)
         harmonics = force.functions // 2
         # By an independent transform: the variance of the level, and of each pair together.
         variance = np.fft.rfft(np.asarray(kernel(np.linspace(0.0, 10.0, 2**14, endpoint=False)))).real / 2**14
@@ -96,7 +97,7 @@ def test_the_default_is_as_good_as_documented(order, largest):
         assert errors[-1] == pytest.approx(variance[harmonics + 1:].sum(), abs=1e-4)
     assert 0.6 * largest < max(errors) < largest
     kernel = squared_exponential(5.03)
-    assert lfm.Periodic(kernel).functions == forces.significant_functions(kernel) == 3
+    assert lfm.Periodic(kernel).functions == significant_functions(kernel) == 3
 
 
 def test_the_error_goes_to_zero():
@@ -125,7 +126,7 @@ def test_nystrom_is_the_paper_s_formula():
     error = np.diag(gram) - np.asarray(force.sde_covariance(at, at))
     assert (error > -1e-12).all()
     assert error.mean() == pytest.approx(values[count:].sum() / 100, rel=1e-9)
-    assert forces.significant_functions(kernel) == (values > 0.01 * values[0]).sum()
+    assert significant_functions(kernel) == (values > 0.01 * values[0]).sum()
 
 
 def test_both_treatments_agree_where_both_apply():

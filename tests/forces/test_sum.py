@@ -8,7 +8,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag
 
-from lfm_ppl.forces import Constant, Matern, Stack, WienerVelocity
+from lfm_ppl.forces import Constant, Matern, WienerVelocity
+from lfm_ppl.forces.sde import Stack
 
 
 def test_a_sum_is_block_diagonal_and_adds():

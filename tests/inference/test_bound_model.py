@@ -138,7 +138,7 @@ def test_the_methods_of_a_bound_model_read_the_model_once():
 def test_what_decides_the_program_is_never_mixed_up():
     lfm.bind(small, TIMES, Y)
     for times, order in ((TIMES + 1.0, 1), (TIMES, 2)):
-        result = lfm.bind(small, times, Y, order=order)
+        result = lfm.bind(small, times, Y, model_kwargs={"order": order})
         expected = numpyro_density(small, (times, Y), {"decay": 0.0}, order=order)
         assert float(result.log_density(np.zeros(1))) == pytest.approx(expected, rel=1e-12)
 

@@ -92,7 +92,7 @@ def censored(times, y=None):
 
 def inflated(times, y=None):
     none = numpyro.sample("none", dist.Beta(2.0, 5.0))
-    family = lfm.Observation(lambda x, u, t: 0.7 + u, lambda f: dist.ZeroInflatedPoisson(none, jnp.exp(f)))
+    family = lfm.DistributionObservation(lambda x, u, t: 0.7 + u, lambda f: dist.ZeroInflatedPoisson(none, jnp.exp(f)))
     observed(family, times, y, scale(), lengthscale())
 
 
@@ -128,7 +128,7 @@ def test_nuts_with_expectation_propagation_is_calibrated(name, tmp_path):
     folder = Path(os.environ.get("LFM_SBC_OUT", tmp_path)) / name
     result = calibration.calibrate(jax.random.key(3), FAMILIES[name], 0.5 * np.arange(32.0),
                                   lambda model: NUTS(model, max_tree_depth=6), data_sets=200, draws=31, thin=10,
-                                  warmup=200, batch=20, folder=folder, report=print)
+                                  warmup=200, batch=20, checkpoint=folder, report=print)
     assert {"scale", "lengthscale", "log likelihood"} < set(result.ranks)
     assert all(len(rank) == 200 for rank in result.ranks.values())
     assert_uniform(result, bins=16)
@@ -141,7 +141,7 @@ def densities(model, times, y, count, keywords=None, known=None, seed=0):
     memory.
     """
     keywords = keywords or {}
-    bound = bind(model, times, y, **keywords).fix(known or {})
+    bound = bind(model, times, y, model_kwargs=keywords).fix(known or {})
     prior = Predictive(handlers.block(model, hide=["y"]), num_samples=count)(jax.random.key(seed), times, y, **keywords)
     trace = handlers.trace(handlers.seed(model, 0)).get_trace(times, y, **keywords)
     draws = {name: biject_to(trace[name]["fn"].support).inv(prior[name]) for name in bound.sites}

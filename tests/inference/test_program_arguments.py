@@ -57,7 +57,7 @@ def patient(shift, amount, variance):
 def test_other_times_inputs_and_errors_compile_nothing_and_give_their_own_density(model):
     def evaluate(patient, y):
         times, keywords = patient
-        return lfm.bind(model, times, y, **keywords).log_density_gradient(Z)
+        return lfm.bind(model, times, y, model_kwargs=keywords).log_density_gradient(Z)
 
     evaluate(patient(0.0, 1.0, 0.1), Y)
     times, keywords = patient(0.2, 1.4, 0.2)
@@ -102,7 +102,8 @@ def test_a_model_that_needs_values_is_compiled_for_them(model):
         keywords = {"gain": np.full((1, 1), gain)}
         expected = -jax.jit(lambda z: potential_energy(model, (times, Y), keywords, z))(  # noqa: B023
             {"lag": Z[0], "rate": Z[1]})
-        assert float(lfm.bind(model, times, Y, **keywords).log_density(Z)) == pytest.approx(float(expected), rel=1e-12)
+        result = lfm.bind(model, times, Y, model_kwargs=keywords).log_density(Z)
+        assert float(result) == pytest.approx(float(expected), rel=1e-12)
 
 
 def test_a_second_subject_of_fit_many_compiles_nothing():

@@ -11,6 +11,7 @@ import pytest
 from systems import whole_state
 
 import lfm_ppl as lfm
+from lfm_ppl.model.state_space import state_space
 
 VARIANCES = jnp.ones(2)
 OBSERVATION = lfm.GaussianObservation(whole_state, VARIANCES)
@@ -93,7 +94,7 @@ def test_models(error, options, message):
     (ValueError, lambda: lfm.simulate(jax.random.key(0), make(), [1.0], steps=0), "steps must be at least 1"),
     (ValueError, lambda: lfm.simulate(jax.random.key(0), make(initial_time=2.0), [1.0]), "initial_time = 2"),
     (TypeError, lambda: lfm.simulate(0, make(), [1.0]), "key, the first argument"),
-    (ValueError, lambda: lfm.state_space(lfm.LatentForceModel(
+    (ValueError, lambda: state_space(lfm.LatentForceModel(
         lambda x, u, t: x, {}, lfm.GaussianObservation(lambda x, u, t: jnp.ones(1), jnp.ones(1)),
         lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))), "neither states nor forces"),
     # Functions of time are evaluated once the first time is known.

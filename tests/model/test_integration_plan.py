@@ -7,6 +7,7 @@ from systems import whole_state
 
 import lfm_ppl as lfm
 from lfm_ppl.model.integration_plan import Dependence, LinearisedInputs
+from lfm_ppl.model.state_space import state_space
 
 NOISE = jnp.array([0.1])
 RAIN = lfm.Input([0.0, 1.0, 2.0], [0.0, 1.0, 0.5], "linear")
@@ -16,7 +17,7 @@ def plan_of(dynamics, forces=None, noise=None, observation=None):
     forces = {"u": lfm.Matern(1.0, 1.0)} if forces is None else forces
     observation = lfm.GaussianObservation(whole_state, NOISE) if observation is None else observation
     model = lfm.LatentForceModel(dynamics, forces, observation, lfm.Gaussian(jnp.ones(1), jnp.eye(1)), noise)
-    return lfm.state_space(model).plan
+    return state_space(model).plan
 
 
 def linear(x, u, t):

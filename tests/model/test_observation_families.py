@@ -46,7 +46,7 @@ CASES = {
     "Student-t": (lfm.StudentTObservation(state, 4.0, 0.5), COUNTS, lambda y, f: stats.t.logpdf(y, 4.0, f, 0.5)),
     "censored": (lfm.CensoredObservation(state, 0.5, left=0.0, right=5.0), np.array([0.0, 0.8, 5.0]), censored),
     "binned": (lfm.CensoredObservation(state, 0.5, width=1.0), np.array([0.0, -1.0, 3.0]), binned),
-    "any distribution": (lfm.Observation(state, lambda f: dist.Geometric(logits=f)), COUNTS,
+    "any distribution": (lfm.DistributionObservation(state, lambda f: dist.Geometric(logits=f)), COUNTS,
                          lambda y, f: stats.geom.logpmf(y + 1, special.expit(f))),
 }
 
@@ -137,11 +137,12 @@ def test_cumulative_probabilities_are_sums_of_the_densities(name):
 
 
 def test_a_family_without_cumulative_probabilities_has_none():
-    family = lfm.Observation(state, lambda f: dist.ZeroInflatedPoisson(0.5, jnp.exp(f)))
+    family = lfm.DistributionObservation(state, lambda f: dist.ZeroInflatedPoisson(0.5, jnp.exp(f)))
     assert np.isnan(family.cumulative(jnp.zeros(2), jnp.ones(2))).all()
-    count = lfm.Observation(state, lambda f: dist.Poisson(jnp.exp(f))).cumulative(jnp.zeros(1), jnp.ones(1))
+    count = lfm.DistributionObservation(state, lambda f: dist.Poisson(jnp.exp(f))).cumulative(jnp.zeros(1), jnp.ones(1))
     np.testing.assert_allclose(np.ravel(count), stats.poisson.cdf([0, 1], 1.0))
-    size = lfm.Observation(state, lambda f: dist.Gamma(2.0, jnp.exp(f))).cumulative(jnp.zeros(1), jnp.ones(1))
+    gamma = lfm.DistributionObservation(state, lambda f: dist.Gamma(2.0, jnp.exp(f)))
+    size = gamma.cumulative(jnp.zeros(1), jnp.ones(1))
     np.testing.assert_allclose(np.ravel(size), stats.gamma.cdf([1, 1], 2.0))
     for concentration in (3e7, 3e8, 1e200):
         limit = lfm.NegativeBinomialObservation(state, concentration).cumulative(jnp.zeros(1), jnp.ones(1))
@@ -171,7 +172,8 @@ BOTH = lfm.Observations(GAUSSIAN, lfm.BernoulliObservation(state))
     (lfm.NegativeBinomialObservation(state, 2.0), [1.0, 0.5], r"y\[1, 1\] .* is 0.5, but NegativeBinomial"),
     (lfm.BinomialObservation(state, 4), [1.0, 5.0], r"y\[1, 1\] .* is 5, but Binomial"),
     (lfm.BernoulliObservation(state), [1.0, 2.0], r"y\[1, 1\] .* is 2, but Bernoulli"),
-    (lfm.Observation(state, lambda f: dist.Poisson(jnp.exp(f))), [1.0, -2.0], r"y\[1, 1\] .* is -2, but the dist"),
+    (lfm.DistributionObservation(state, lambda f: dist.Poisson(jnp.exp(f))), [1.0, -2.0],
+     r"y\[1, 1\] .* is -2, but the dist"),
     (BOTH, [0.3, -2.0, 1.0, 0.5], r"y\[1, 3\] \(y3, row 2 of the data\) is 0.5, but Bernoulli"),
 ])
 def test_impossible_data_are_errors_that_name_row_and_column(family, row, message):
@@ -193,8 +195,8 @@ def test_impossible_data_are_errors_that_name_row_and_column(family, row, messag
      "exposure of PoissonObservation has 3 rows"),
     (lambda: model(lfm.PoissonObservation(lambda x, u, t: x[0])), "must return a vector"),
     (lambda: model(lfm.PoissonObservation(state), mean=800.0), "output 'y0' is not finite at the prior"),
-    (lambda: model(lfm.Observation(state, lambda f: dist.Poisson(1.0))), r"batch shape \(2,\)"),
-    (lambda: lfm.Observations(lfm.GaussianObservation(state, jnp.eye(2))), "needs variances"),
+    (lambda: model(lfm.DistributionObservation(state, lambda f: dist.Poisson(1.0))), r"batch shape \(2,\)"),
+    (lambda: lfm.Observations(lfm.GaussianObservation(state, jnp.eye(2))), "Gaussian and needs sd"),
 ])
 def test_errors(make, message):
     with pytest.raises(ValueError, match=message):
@@ -223,8 +225,19 @@ def test_probabilities_outside_of_the_unit_interval_have_no_density():
     np.testing.assert_allclose(result, [-np.inf, np.log(0.25), -np.inf])
 
 
+@pytest.mark.parametrize(("family", "slope"), [
+    (lfm.PoissonObservation(state, "identity", exposure=2.0), -2.0),
+    (lfm.NegativeBinomialObservation(state, 3.0, "identity", exposure=2.0), -2.0)])
+def test_at_rate_zero_the_count_is_zero(family, slope):
+    f, y = jnp.array([0.0, 0.0, -0.1, -0.1]), jnp.array([0.0, 2.0, 0.0, 2.0])
+    np.testing.assert_array_equal(family.log_prob(f, y), [0.0, -np.inf, -np.inf, -np.inf])
+    gradient = jax.grad(lambda f: jnp.where(jnp.isfinite(family.log_prob(f, y)), family.log_prob(f, y), 0.0).sum())(f)
+    np.testing.assert_allclose(gradient, [slope, 0.0, 0.0, 0.0])
+    assert float(family.log_prob(jnp.array([1e-9]), jnp.zeros(1))[0]) == pytest.approx(-2e-9)
+
+
 def test_limits_of_rounded_values_leave_nothing_out():
-    family = lfm.CensoredObservation(lambda x, u, t: x, scale=1.0, left=0.0, width=1.0)
+    family = lfm.CensoredObservation(lambda x, u, t: x, sd=1.0, left=0.0, width=1.0)
     values = jnp.arange(0.0, 12.0)
     total = jax.vmap(lambda y: family.log_prob(jnp.array([0.3]), y[None])[0])(values)
     assert float(jnp.exp(total).sum()) == pytest.approx(1.0, abs=1e-12)

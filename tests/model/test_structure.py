@@ -10,6 +10,7 @@ import pytest
 from systems import DoubleWell, Motif, Oscillator, identity, softplus, whole_state
 
 import lfm_ppl as lfm
+from lfm_ppl.model.state_space import state_space
 from lfm_ppl.model.structure import pattern
 
 M = lfm.Matern
@@ -19,7 +20,7 @@ def structure(dynamics, size, forces=("u",), **options):
     model = lfm.LatentForceModel(
         dynamics, {name: M(1.0, 1.0) for name in forces}, lfm.GaussianObservation(whole_state, jnp.ones(size)),
         lfm.Gaussian(jnp.ones(size), jnp.eye(size)), **options)
-    result = lfm.state_space(model).drift_structure
+    result = state_space(model).drift_structure
     names = (*model.state_names, *model.force_names)
     return tuple({names[i] for i in indices} for indices in (result.nonlinear, result.averaged, result.constant))
 

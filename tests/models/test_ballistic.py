@@ -84,7 +84,8 @@ def test_gross_errors_move_parameters_only_where_errors_are_gaussian():
     data = file.simulate()
     shifts = []
     for df in (4.0, 0.0):
-        bound = bind(file.model, data.times, data.y, **file.keywords(data, {"df": df})).fix(file.anchors(data))
+        bound = bind(file.model, data.times, data.y, model_kwargs=file.keywords(data, {"df": df}))
+        bound = bound.fix(file.anchors(data))
         start = bound.draw(jax.random.key(0))
         for place in range(3):
             rng = np.random.default_rng(place)

@@ -135,9 +135,9 @@ def test_p53_posterior(file):
     assert z.abs().max() < 4.0, z.round(1).to_dict()
 
     forces = ResultView.of(nuts).group("trajectories")["forces"].isel(force=0)
-    peak = forces["at"].values[forces.mean(["chain", "draw"]).values.argmax()]
+    peak = forces["time"].values[forces.mean(["chain", "draw"]).values.argmax()]
     assert peak < 6.0
-    each = forces["at"].values[forces.values.argmax(axis=forces.dims.index("at"))]
+    each = forces["time"].values[forces.values.argmax(axis=forces.dims.index("time"))]
     assert np.mean(each < 6.0) > 0.9
 
 
@@ -210,7 +210,8 @@ def test_log_evidence_is_that_of_importance_sampling(file, activity, link):
     """Within 0.05 at ten draws from the posterior of the p53 data; a single pass is off by up to six nats."""
     data = file.prepare(lfm.read_csv(P53))
     keywords = file.keywords(data, {"link": link})
-    bound = bind(lfm.approximate(file.model, iterations=0), data.times, data.y, **keywords).fix(file.anchors(data))
+    bound = bind(lfm.approximate(file.model, iterations=0), data.times, data.y, model_kwargs=keywords)
+    bound = bound.fix(file.anchors(data))
     objective = bound.objective()
     mode = newton(objective, quasi_newton(objective, bound.draw(jax.random.key(0))).point)
     errors, of_single_pass = [], []

@@ -40,7 +40,7 @@ def test_backward_simulation_of_a_linear_model():
     sd = np.sqrt(np.asarray(exact.covariance)[:, [0, 1], [0, 1]])
     assert_close(result, exact.mean, sd, 1500 / 2)
     force = result.force("u")
-    assert np.allclose(force.mean, result.mean[:, 1]) and force.draws.shape == (1500, 6)
+    assert np.allclose(force.mean, result.mean[:, 1]) and result.trajectories.forces["u"].shape == (1500, 6)
     assert np.all(np.abs(force.mean - exact.force("u").mean) < 5.0 * exact.force("u").sd / np.sqrt(750))
     # Two states of one trajectory: the covariance of the exact joint distribution, too.
     exact_draws = exact.sample(jax.random.key(1), 4000).state[:, :, 0]
@@ -114,4 +114,4 @@ def test_an_unknown_force_is_named():
     result = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=20, draws=5)
     with pytest.raises(ValueError, match="'v'"):
         result.force("v")
-    assert np.array_equal(result.state("x0").draws, result.draws[:, :, 0])
+    assert np.array_equal(result.trajectories.state, result.draws[:, :, :1])

@@ -21,6 +21,7 @@ from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.taylor import Taylor
+from lfm_ppl.model.state_space import state_space
 
 pytestmark = pytest.mark.performance
 
@@ -79,7 +80,7 @@ def seconds(run, *arguments):
 def test_a_pass_takes_at_most_one_and_a_half_smoother_passes():
     times, y = data(1501, SHAPES["sine"])
     given = problem(times, y)
-    ssm = lfm.state_space(MODEL)
+    ssm = state_space(MODEL)
     grid = build_time_grid(ssm, times, 1)
 
     @eqx.filter_jit

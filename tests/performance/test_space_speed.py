@@ -18,7 +18,7 @@ def test_fifty_sensors_and_a_thousand_times(benchmark):
     def log_density(theta):
         diffusivity, decay, scale, space, time, noise = theta
         source = lfm.SpectralField(basis, lfm.Matern(scale, space), lfm.Matern(1.0, time, order=0))
-        model = lfm.heat(source, diffusivity, decay, sensors=sensors, noise=noise)
+        model = lfm.heat(source, diffusivity, decay, sensors=sensors, covariance=noise)
         return lfm.MarginalLikelihood(model, times).log_prob(y)
 
     theta, run = jnp.array([0.02, 0.1, 1.0, 0.3, 1.0, 0.1]), jax.jit(jax.value_and_grad(log_density))

@@ -130,9 +130,9 @@ def test_fit_draws_data_means_and_quantiles(result, datasets):
         draws = outputs.values[..., index].reshape(200, -1)
         mean = the_line(axes, "posterior mean")
         np.testing.assert_allclose(mean.get_ydata(), draws.mean(axis=0))
-        np.testing.assert_array_equal(mean.get_xdata(), outputs["at"].values)
+        np.testing.assert_array_equal(mean.get_xdata(), outputs["time"].values)
         outer, inner = map(edges, bands(axes))
-        for x, low, high in zip(outputs["at"].values, *np.quantile(draws, [0.025, 0.975], axis=0), strict=True):
+        for x, low, high in zip(outputs["time"].values, *np.quantile(draws, [0.025, 0.975], axis=0), strict=True):
             np.testing.assert_allclose(inner[x], [low, high])
         assert (min(outer), max(outer)) == (0.0, 12.0)
         for at in np.unique(time):  # replicates are pooled
@@ -175,30 +175,30 @@ def test_forces_states_and_deterministics_draw_means_bands_and_truth(datasets, p
         draws = variable.values[..., index].reshape(200, -1)
         np.testing.assert_allclose(the_line(axes, "posterior mean").get_ydata(), draws.mean(axis=0))
         true = the_line(axes, "truth")
-        np.testing.assert_array_equal(true.get_xdata(), truth["at_truth"].values)
+        np.testing.assert_array_equal(true.get_xdata(), truth["time"].values)
         np.testing.assert_array_equal(true.get_ydata(), truth.values[:, index])
         (band,) = bands(axes)
-        for x, low, high in zip(variable["at"].values, *np.quantile(draws, [0.025, 0.975], axis=0), strict=True):
+        for x, low, high in zip(variable["time"].values, *np.quantile(draws, [0.025, 0.975], axis=0), strict=True):
             np.testing.assert_allclose(edges(band)[x], [low, high])
 
 
 def test_the_truth_is_drawn_where_it_is_known_as_far_as_the_trajectories(datasets):
-    at, truth = datasets["trajectories"]["at"].values, datasets["truth"].sel(force=["stress"])
-    later = truth.assign_coords(at_truth=truth["at_truth"].values + 0.5 * np.ptp(at))
+    at, truth = datasets["trajectories"]["time"].values, datasets["truth"].sel(force=["stress"])
+    later = truth.assign_coords(time=truth["time"].values + 0.5 * np.ptp(at))
     without, axes = plot_forces(arviz_data.build({**datasets, "truth": later})).axes
     assert not lines(without, "truth")
     drawn = the_line(axes, "truth").get_xdata()
-    assert 0 < len(drawn) < truth.sizes["at_truth"] and at.min() <= drawn.min() and drawn.max() <= at.max()
+    assert 0 < len(drawn) < truth.sizes["time"] and at.min() <= drawn.min() and drawn.max() <= at.max()
 
 
 def test_bands_are_those_of_the_summary_where_there_is_one(datasets):
     paths = datasets["trajectories"]
     for name, kind, plot, band_index in (("forces", "force", plot_forces, 0), ("new_data", "output", plot_fit, 0)):
-        ends = np.stack([np.full((paths.sizes["at"], paths.sizes[kind]), value) for value in (0.5, -1.0, 2.0)])
-        summary = paths.assign({f"{name}_summary": (("statistic", "at", kind), ends)})
+        ends = np.stack([np.full((paths.sizes["time"], paths.sizes[kind]), value) for value in (0.5, -1.0, 2.0)])
+        summary = paths.assign({f"{name}_summary": (("statistic", "time", kind), ends)})
         axes = plot(arviz_data.build({**datasets, "trajectories": summary})).axes[1]
         band = edges(bands(axes)[band_index])
-        assert set(band) == set(paths["at"].values)
+        assert set(band) == set(paths["time"].values)
         assert set(map(tuple, map(sorted, band.values()))) == {(-1.0, 2.0)}
 
 
@@ -206,8 +206,8 @@ def test_a_force_that_repeats_often_shows_its_last_periods(datasets):
     paths = datasets["trajectories"]
     paths["forces"].attrs[PERIODS] = json.dumps({"stress": 1.0})
     p53, stress = plot_forces(arviz_data.build(datasets)).axes
-    end = paths["at"].values[-1]
-    assert the_line(p53, "posterior mean").get_xdata()[0] == paths["at"].values[0]
+    end = paths["time"].values[-1]
+    assert the_line(p53, "posterior mean").get_xdata()[0] == paths["time"].values[0]
     assert end - 3.0 <= the_line(stress, "posterior mean").get_xdata()[0] < end - 2.5
     ahead = predictions(datasets, np.linspace(13.0, 30.0, 80), 12.0)
     stress = plot_forces(arviz_data.build({**datasets, "predictions": ahead})).axes[1]
@@ -218,7 +218,7 @@ def test_forecasts_continue_mean_and_bands_as_curves_or_bars(datasets):
     time = np.linspace(12.0, 30.0, 80)
     ahead = predictions(datasets, time, 12.0)
     figure = plot_forces(arviz_data.build({**datasets, "predictions": ahead}))
-    later = time > datasets["trajectories"]["at"].values[-1]
+    later = time > datasets["trajectories"]["time"].values[-1]
     for index, axes in enumerate(figure.axes):
         drawn = edges(bands(axes)[-1])
         bounds = np.quantile(ahead["forces"].values[..., index].reshape(-1, 80), (0.025, 0.975), axis=0)[:, later]
@@ -236,7 +236,7 @@ def test_forecasts_continue_mean_and_bands_as_curves_or_bars(datasets):
 def test_a_short_forecast_shows_the_last_rows_and_held_out_data(datasets):
     last, end = 12.0, 14.0
     paths = datasets["trajectories"]
-    datasets["trajectories"] = paths.sel(at=paths["at"] <= last)
+    datasets["trajectories"] = paths.sel(time=paths["time"] <= last)
     ahead = predictions(datasets, np.linspace(12.5, end, 5), last)
     y = xr.DataArray([[1.0, 2.0, 3.0], [1.5, np.nan, 2.5]], dims=("time", "output"))
     held_out = xr.Dataset({"y": y}, {"time": [13.0, 13.5], "output": datasets["data"]["output"]})
@@ -270,7 +270,7 @@ def test_doses_are_marked_and_their_rows_are_not_missing(datasets):
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_curves_at_few_times_are_bars_and_lines(datasets, count):
-    paths = datasets["trajectories"].isel(at=np.arange(count))
+    paths = datasets["trajectories"].isel(time=np.arange(count))
     keep = {name: datasets[name] for name in ("data", "observed_data", "posterior_predictive") if name in datasets}
     for plot in (plot_fit, plot_forces):
         axes = plot(arviz_data.build({**keep, "trajectories": paths})).axes[0]

@@ -17,6 +17,7 @@ from lfm_ppl.accuracy.check_accuracy import check_accuracy
 from lfm_ppl.accuracy.correction import correct_posterior
 from lfm_ppl.accuracy.report import AccuracyReport
 from lfm_ppl.accuracy.verdict import Findings, judge
+from lfm_ppl.model.state_space import state_space
 from lfm_ppl.plots import plot_accuracy
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results.result_view import ResultView
@@ -311,7 +312,7 @@ def test_correction_keeps_data_truth_and_the_layout_of_trajectories(checked):
     corrected = correct_posterior(result, well, trajectory_draws=6)
     old, new = (ResultView.of(one).group("trajectories") for one in (result, corrected))
     assert new["states"].dims == old["states"].dims and new["states"].shape == (1, 6, *old["states"].shape[2:])
-    np.testing.assert_array_equal(new["at"], old["at"])
+    np.testing.assert_array_equal(new["time"], old["time"])
     chains, draws = (ResultView.of(corrected).posterior.sizes[name] for name in ("chain", "draw"))
     for name in ("log_likelihood", "posterior_predictive"):
         assert ResultView.of(corrected).group(name)["y"].shape[:2] == (chains, draws)
@@ -435,8 +436,8 @@ def test_the_grid_is_not_for_models_with_events():
     model = lfm.LatentForceModel(
         lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1), events=[lfm.Dose([1.0], 1.0, "x0")])
-    assert accuracy_check._kind("auto", lfm.state_space(model)) == "particles"
+    assert accuracy_check._kind("auto", state_space(model)) == "particles"
     with pytest.raises(ValueError, match="events"):
-        accuracy_check._kind("grid", lfm.state_space(model))
+        accuracy_check._kind("grid", state_space(model))
     with pytest.raises(ValueError, match="events"):
         lfm.fokker_planck(model, np.arange(3.0), np.ones((3, 1)))

@@ -80,13 +80,13 @@ def test_two_sites_of_several_outputs_and_series():
     result = converted(both, times, y, {"shared": draws_of(), "rate": draws_of(2)})
     pointwise = check_arviz(result, {"one": 10, "many": 9})
     for site, terms in pointwise.items():
-        view = lfm.select_site(result, site)
+        view = lfm.select_series(result, site)
         np.testing.assert_array_equal(check_arviz(view, {"y": len(terms)})["y"], terms)
     # Correlated noise: an entry is left out, and the other one of its row is not.
     rate = ResultView.of(result).posterior["shared"].values[0, 3]
     likelihood, without = lfm.MarginalLikelihood(build(rate, (1.0, 2.0)), TIMES[0]), y["one"].copy()
     without[2, 0] = np.nan
-    left_out = ResultView.of(lfm.select_site(result, "one")).group("log_likelihood")["y"][0, 3]
+    left_out = ResultView.of(lfm.select_series(result, "one")).group("log_likelihood")["y"][0, 3]
     is_entry = (left_out["time"] == TIMES[0, 2]).values & (left_out["output"] == left_out["output"][0]).values
     np.testing.assert_allclose(left_out.values[is_entry], likelihood.log_prob(y["one"]) - likelihood.log_prob(without),
                                atol=1e-9)

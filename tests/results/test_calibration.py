@@ -116,7 +116,7 @@ def test_tasks_in_a_folder_find_the_same_ranks_and_go_on(conjugate, tmp_path):
             (tmp_path / "data-sets-00200-00399.npz").unlink()
     with pytest.raises(ValueError, match="key"):
         calibration.calibrate(jax.random.key(6), level, np.arange(3.0), lambda model: Exact(1.0), data_sets=400, thin=1,
-                              warmup=1, batch=200, folder=tmp_path)
+                              warmup=1, batch=200, checkpoint=tmp_path)
 
 
 def test_ranks_survive_a_file_and_are_not_overwritten(tmp_path):

@@ -133,7 +133,7 @@ def test_unconverged_factors_are_counted_and_named(result):
     """With few sweeps allowed they converge at some points and not at others."""
     stored = json.loads(ResultView.of(result).attrs["factor_failures"])
     assert stored == [100, 0, 0] and not any("factors" in text for text in arviz_data.convergence_warnings(result))
-    bound = lfm.bind(counts, TIMES, COUNTS, factors=FactorSettings(sweeps=9))
+    bound = lfm.bind(counts, TIMES, COUNTS, model_kwargs={"factors": FactorSettings(sweeps=9)})
     computed = factor_failures(bound, 2.0 * np.random.default_rng(0).normal(size=(1, 50, 2)))
     assert 0 < computed.unconverged < computed.points and computed.unconverged <= computed.impossible
     for impossible in (9, 0):

@@ -28,10 +28,10 @@ def result():
     rng = np.random.default_rng(0)
     scale = xr.Dataset({"scale": (("chain", "draw"), rng.uniform(0.5, 1.0, (2, 40)))}, {"draw": np.arange(40)})
     names = {"state": list(BASIS.names), "force": [f"source {index}" for index in range(3)]}
-    trajectories = xr.Dataset({f"{kind}s": (("chain", "draw", "at", kind), rng.normal(size=(2, 20, 9, 3)))
-                               for kind in names}, {"at": TIMES, "draw": np.arange(0, 40, 2), **names})
-    truth = xr.Dataset({f"{kind}s": (("at_truth", kind), rng.normal(size=(5, 3))) for kind in names},
-                       {"at_truth": TIMES[::2], **names}).assign(scale=0.7)
+    trajectories = xr.Dataset({f"{kind}s": (("chain", "draw", "time", kind), rng.normal(size=(2, 20, 9, 3)))
+                               for kind in names}, {"time": TIMES, "draw": np.arange(0, 40, 2), **names})
+    truth = xr.Dataset({f"{kind}s": (("time", kind), rng.normal(size=(5, 3))) for kind in names},
+                       {"time": TIMES[::2], **names}).assign(scale=0.7)
     return build({"posterior": scale, "trajectories": trajectories, "truth": truth})
 
 

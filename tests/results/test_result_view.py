@@ -27,7 +27,7 @@ def test_a_missing_group_or_a_choice_of_sites_is_named(result):
         view.group("accuracy")
     sites = ResultView({"data_a": xr.Dataset()}, {LIKELIHOODS: json.dumps({"a": {}, "b": {}})})
     for look_up in (lambda: sites.group("data"), sites.refuse_several_sites):
-        with pytest.raises(ValueError, match=r"select it: lfm.select_site\(result, 'a'\)"):
+        with pytest.raises(ValueError, match=r"select it: lfm.select_series\(result, 'a'\)"):
             look_up()
 
 

@@ -85,10 +85,10 @@ def test_summaries_of_a_panel_with_normal_parts_and_with_points():
     lead, where = (2, 3, 4), (5,)  # chains, draws, series; times
     mean, sd, points = rng.normal(size=(*lead, *where, 2)), rng.uniform(0.5, 1.0, (*lead, *where, 2)), rng.normal(
         size=(*lead, 8, *where, 1))
-    dims = ("chain", "draw", "series", "at")
+    dims = ("chain", "draw", "series", "time")
     paths = xr.Dataset({"states": ((*dims, "state"), mean), "outputs": ((*dims, "output"), points[..., 0, :, :])})
     result = with_summaries(paths, {"state_mean": mean, "state_sd": sd, "output_points": points})
-    assert result["states_summary"].dims == ("statistic", "series", "at", "state")
+    assert result["states_summary"].dims == ("statistic", "series", "time", "state")
     high = result["states_summary"].sel(statistic="q97.5").values
     np.testing.assert_allclose(stats.norm.cdf(high, mean, sd).mean(axis=(0, 1)), 0.975, atol=1e-5)
     low = np.quantile(points, 0.025, axis=(0, 1, 3))

@@ -9,6 +9,7 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.model.simulate import simulate
+from lfm_ppl.model.state_space import state_space
 from tests.space import references
 
 TIMES = np.array([0.0, 0.3, 0.4, 1.1, 2.0])
@@ -43,7 +44,7 @@ def equation(kind, boundary, dimension, modes=3, sensors=None, **options):
     basis = lfm.LaplaceBasis((0.0, 1.0) if dimension == 1 else RECTANGLE, (modes,) * dimension, boundary)
     source = lfm.SpectralField(basis, SPATIAL[dimension][0], lfm.Matern(1.0, 0.7, order=1))
     parameters = (0.05, 0.4) if kind == "heat" else (1.1, 0.3)
-    return basis, source, getattr(lfm, kind)(source, *parameters, initial_time=0.0, noise=0.02,
+    return basis, source, getattr(lfm, kind)(source, *parameters, initial_time=0.0, covariance=0.02,
                                              sensors=PLACES[dimension] if sensors is None else sensors, **options)
 
 
@@ -72,7 +73,7 @@ def coefficient_covariances(kind, boundary, dimension, modes=3):
     pytest.param("heat", "dirichlet", 2, marks=pytest.mark.slow)])
 def test_equals_dense_algebra(kind, boundary, dimension):
     basis, _, model = equation(kind, boundary, dimension)
-    assert lfm.state_space(model).plan.has_exact_offset, "it takes exact transitions"
+    assert state_space(model).plan.has_exact_offset, "it takes exact transitions"
     y = np.random.default_rng(0).normal(size=(len(TIMES), 3))
     y[1, 2] = np.nan
     seen = np.isfinite(y).ravel()
@@ -113,7 +114,7 @@ def test_an_initial_field_spreads_by_the_heat_kernel(boundary, sign):
             a * np.exp(-0.5 * (r - centre)**2 / variance) for a, centre in images)
 
     start = lfm.Gaussian(basis.coefficients(bump), np.zeros(81))
-    model = lfm.heat(basis, 0.02, 0.3, sensors=places, noise=1.0, initial=start)
+    model = lfm.heat(basis, 0.02, 0.3, sensors=places, covariance=1.0, initial=start)
     expected = np.array([bump(places, t) for t in times])
     np.testing.assert_allclose(field(basis, model, times, places), expected, atol=1e-8)
 
@@ -127,7 +128,7 @@ def test_a_plucked_string_moves_as_dalembert_says():
         return np.sign(r) * np.exp(-0.5 * ((np.abs(r) - 0.4) / 0.05)**2)
 
     start = lfm.Gaussian(jnp.concatenate([basis.coefficients(odd), jnp.zeros(90)]), np.zeros(180))
-    model = lfm.wave(basis, speed, 0.0, sensors=places, noise=1.0, initial=start)
+    model = lfm.wave(basis, speed, 0.0, sensors=places, covariance=1.0, initial=start)
     expected = [0.5 * (odd(places - speed * t) + odd(places + speed * t)) for t in times]
     np.testing.assert_allclose(field(basis, model, times, places), expected, atol=1e-8)
 
@@ -141,7 +142,7 @@ def test_a_mode_of_a_damped_rectangle_is_a_cosine():
         return np.cos(np.pi * r[:, 0] / 2) * np.cos(2 * np.pi * r[:, 1])
 
     start = lfm.Gaussian(jnp.concatenate([basis.coefficients(shape), jnp.zeros(6)]), np.zeros(12))
-    model = lfm.wave(basis, 0.8, 0.4, sensors=places, noise=1.0, initial=start)
+    model = lfm.wave(basis, 0.8, 0.4, sensors=places, covariance=1.0, initial=start)
     damped = np.sqrt(frequency**2 - 0.04)
     amplitude = np.exp(-0.2 * times) * (np.cos(damped * times) + 0.2 / damped * np.sin(damped * times))
     np.testing.assert_allclose(field(basis, model, times, places), amplitude[:, None] * shape(places), atol=1e-8)
@@ -189,7 +190,7 @@ def test_gradients(kind):
     def log_density(theta):
         first, second, scale, length, time, noise = theta
         source = lfm.SpectralField(basis, lfm.Matern(scale, length), lfm.Matern(1.0, time))
-        model = getattr(lfm, kind)(source, first, second, sensors=PLACES[1], noise=noise)
+        model = getattr(lfm, kind)(source, first, second, sensors=PLACES[1], covariance=noise)
         return lfm.MarginalLikelihood(model, TIMES).log_prob(y)
 
     theta = jnp.array([0.3, 0.4, 1.3, 0.5, 0.7, 0.2])
@@ -205,7 +206,7 @@ def test_a_stiff_or_smooth_expansion_has_finite_gradients():
 
     def log_density(length, diffusivity):
         source = lfm.SpectralField(basis, lfm.SquaredExponential(1.0, length), lfm.Matern(1.0, 1.0))
-        model = lfm.heat(source, diffusivity, 0.1, sensors=PLACES[1], noise=0.01)
+        model = lfm.heat(source, diffusivity, 0.1, sensors=PLACES[1], covariance=0.01)
         return lfm.MarginalLikelihood(model, TIMES).log_prob(np.ones((len(TIMES), 3)))
 
     gradient = jax.jit(jax.grad(log_density, (0, 1)))(1.0, 10.0)
@@ -232,13 +233,13 @@ BASIS = lfm.LaplaceBasis((0.0, 1.0), 3)
     (lambda: lfm.SpectralField(BASIS, lfm.Matern(1.0, 1.0), 3.0), TypeError, "temporal_force"),
     (lambda: lfm.SpectralField(3, lfm.Matern(1.0, 1.0), lfm.Matern(1.0, 1.0)), TypeError, "basis"),
     (lambda: lfm.SpectralField(BASIS, lfm.Matern(1.0, 1.0, mean=2.0), lfm.Matern(1.0, 1.0)), ValueError, "mean"),
-    (lambda: lfm.heat("rod", 1.0, 1.0, sensors=PLACES[1], noise=1.0), TypeError, "source"),
-    (lambda: lfm.heat(BASIS, -1.0, 1.0, sensors=PLACES[1], noise=1.0), ValueError, "diffusivity"),
-    (lambda: lfm.heat(BASIS, np.ones(2), 1.0, sensors=PLACES[1], noise=1.0), ValueError, "diffusivity"),
-    (lambda: lfm.heat(BASIS, 1.0, 1.0, sensors=np.array([2.0]), noise=1.0), ValueError, "domain"),
-    (lambda: lfm.heat(BASIS, 1.0, 1.0, sensors=PLACES[1], noise=0.0), ValueError, "noise"),
-    (lambda: lfm.heat(BASIS, 1.0, 1.0, sensors=PLACES[1], noise=np.ones(2)), ValueError, "covariance"),
-    (lambda: lfm.wave(BASIS, 1.0, 1.0, sensors=PLACES[1], noise=1.0, initial=lfm.Gaussian(np.zeros(3), np.eye(3))),
+    (lambda: lfm.heat("rod", 1.0, 1.0, sensors=PLACES[1], covariance=1.0), TypeError, "source"),
+    (lambda: lfm.heat(BASIS, -1.0, 1.0, sensors=PLACES[1], covariance=1.0), ValueError, "diffusivity"),
+    (lambda: lfm.heat(BASIS, np.ones(2), 1.0, sensors=PLACES[1], covariance=1.0), ValueError, "diffusivity"),
+    (lambda: lfm.heat(BASIS, 1.0, 1.0, sensors=np.array([2.0]), covariance=1.0), ValueError, "domain"),
+    (lambda: lfm.heat(BASIS, 1.0, 1.0, sensors=PLACES[1], sd=-1.0), ValueError, "sd"),
+    (lambda: lfm.heat(BASIS, 1.0, 1.0, sensors=PLACES[1], covariance=np.ones(2)), ValueError, "covariance"),
+    (lambda: lfm.wave(BASIS, 1.0, 1.0, sensors=PLACES[1], covariance=1.0, initial=lfm.Gaussian(np.zeros(3), np.eye(3))),
      ValueError, "initial"),
 ])
 def test_malformed_input(make, error, words):

@@ -83,13 +83,13 @@ def test_the_rate_as_a_constant_state_against_a_search_on_the_dense_cost():
     y = problem.record("half sines", 1).y[:601:25]
     estimate = lfm.full_information(problem.companion(1.0, jnp.zeros(3), learnt=True), times, y, grid=times, steps=16,
                                     lower={"factor": 0.0, "rate": 0.0}, tolerance=1e-11)
-    rate = float(estimate.state("rate")[0])
-    assert estimate.converged and np.ptp(estimate.state("rate")) < 1e-9 and np.asarray(estimate.active)[:, 0].any()
+    rate = float(estimate.state("rate").mean[0])
+    assert estimate.converged and np.ptp(estimate.state("rate").mean) < 1e-9 and np.asarray(estimate.active)[:, 0].any()
     best = minimize_scalar(lambda candidate: dense_cost(candidate, rate, np.sqrt(3.0), times, y[:, 0])[0],
                            bounds=(1e-3, 3.0), method="bounded", options={"xatol": 1e-8})
     cost, force = dense_cost(best.x, rate, np.sqrt(3.0), times, y[:, 0])
     assert rate == pytest.approx(best.x, abs=2e-5) and float(estimate.objective) == pytest.approx(cost, abs=2e-6)
-    np.testing.assert_allclose(estimate.state("factor"), force, atol=2e-5)
+    np.testing.assert_allclose(estimate.state("factor").mean, force, atol=2e-5)
 
 
 @pytest.mark.slow

@@ -192,8 +192,8 @@ def test_dates_are_counted_in_the_unit_that_the_model_names():
         result = lfm.fit(model, *data, at=at, model_kwargs={"unit": "d"}, **OPTIONS)
         np.testing.assert_allclose(result["data"]["time"], np.arange(6.0, 14.0) / 24, rtol=1e-15)
         np.testing.assert_allclose(result["posterior"]["rate"], plain["posterior"]["rate"], rtol=1e-8)
-        assert result["trajectories"]["at"].attrs["units"] == "d"
-        np.testing.assert_allclose(result["trajectories"]["at"], [13 / 24], rtol=1e-15)
+        assert result["trajectories"]["time"].attrs["units"] == "d"
+        np.testing.assert_allclose(result["trajectories"]["time"], [13 / 24], rtol=1e-15)
 
 
 def test_held_out_numbers_are_in_the_unit_of_the_result():
@@ -268,7 +268,7 @@ REFUSALS = {
     "simulate": lambda times: lfm.simulate(jax.random.key(0), system(), times),
     "Input": lambda times: lfm.Input(times, np.zeros(3)),
     "full_information": lambda times: lfm.full_information(system(), times, np.zeros((3, 1)), lower={"u": 0.0}),
-    "moving_horizon": lambda times: lfm.moving_horizon(system(), times, np.zeros((3, 1)), 3, lower={"u": 0.0}),
+    "moving_horizon": lambda times: lfm.MovingHorizon(system(), 3, lower={"u": 0.0}).estimate(times, np.zeros((3, 1))),
     "backtest": lambda times: lfm.backtest(model, times, np.zeros((3, 1)), horizon=1),
     "fit_many": lambda times: lfm.fit_many(model, {"a": (times, np.zeros((3, 1)))}),
     "initial time": lambda times: system(initial_time=times[0]),

@@ -1,12 +1,13 @@
 """How XLA compiles."""
 
 import os
+import subprocess
+import sys
 
 import jaxlib.version
 import pytest
 
-import lfm_ppl as lfm
-from lfm_ppl.utils.compilation import quick_compilation
+from lfm_ppl.utils.compilation import fast_loops, quick_compilation
 
 OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
@@ -23,9 +24,9 @@ def test_fast_loops_join_the_flags_that_are_there(monkeypatch, before, after):
         monkeypatch.delenv("XLA_FLAGS", raising=False)
     else:
         monkeypatch.setenv("XLA_FLAGS", before)
-    lfm.fast_loops()
+    fast_loops()
     assert os.environ["XLA_FLAGS"] == after
-    lfm.fast_loops()
+    fast_loops()
     assert os.environ["XLA_FLAGS"] == after, "once is enough"
 
 
@@ -46,3 +47,21 @@ def test_quick_compilation_uses_the_switches_that_a_version_has(monkeypatch, ver
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     quick_compilation(0)
     assert len(os.environ["XLA_FLAGS"].split()) == switches
+
+
+@pytest.mark.parametrize(("before", "environment", "devices"), [
+    ("", {}, 3), ("", {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}, 2), ("", {"PJRT_NPROC": "1"}, 1),
+    ("jax.numpy.ones(2).block_until_ready()", {}, 1)])
+def test_a_first_fit_has_a_device_for_each_chain(before, environment, devices):
+    code = f"""
+import jax, os
+from lfm_ppl.utils.compilation import prepare_chains
+{before}
+flags = os.environ.get("XLA_FLAGS")
+prepare_chains(3)
+prepare_chains(4)
+assert jax.local_device_count() == {devices}, jax.local_device_count()
+assert (os.environ.get("XLA_FLAGS") == flags) == {bool(before) or "PJRT_NPROC" in environment}
+"""
+    kept = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "PJRT_NPROC")}
+    subprocess.run([sys.executable, "-c", code], check=True, env={**kept, "JAX_PLATFORMS": "cpu", **environment})

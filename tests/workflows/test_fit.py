@@ -71,22 +71,23 @@ def test_groups_and_dimensions(nuts):
         "log_prior": {name: ("chain", "draw") for name in ("decay", "lengthscale", "noise_sd")},
         "one_step_ahead": {"log_density": ("chain", "draw", "time"), "residual": ("chain", "draw", "time", "output")},
         "posterior_predictive": {"y": ("chain", "draw", "observation")},
-        "trajectories": {"forces": ("chain", "draw", "at", "force"), "states": ("chain", "draw", "at", "state"),
-                         "outputs": ("chain", "draw", "at", "output"),
-                         "deterministics": ("chain", "draw", "at", "deterministic"),
-                         "deterministics_summary": ("statistic", "at", "deterministic"),
-                         "forces_summary": ("statistic", "at", "force"), "states_summary": ("statistic", "at", "state"),
-                         "outputs_summary": ("statistic", "at", "output"),
-                         "new_data_summary": ("statistic", "at", "output")},
+        "trajectories": {"forces": ("chain", "draw", "time", "force"), "states": ("chain", "draw", "time", "state"),
+                         "outputs": ("chain", "draw", "time", "output"),
+                         "deterministics": ("chain", "draw", "time", "deterministic"),
+                         "deterministics_summary": ("statistic", "time", "deterministic"),
+                         "forces_summary": ("statistic", "time", "force"),
+                         "states_summary": ("statistic", "time", "state"),
+                         "outputs_summary": ("statistic", "time", "output"),
+                         "new_data_summary": ("statistic", "time", "output")},
         "predictions": {"y": ("chain", "draw", "time", "output"), "y_mean": ("chain", "draw", "time", "output"),
                         "y_sd": ("chain", "draw", "time", "output"), "outputs_sd": ("chain", "draw", "time", "output"),
                         "outputs": ("chain", "draw", "time", "output"), "forces": ("chain", "draw", "time", "force"),
                         "states": ("chain", "draw", "time", "state"),
                         "deterministics": ("chain", "draw", "time", "deterministic")},
         "data": {"y": ("time", "output")}, "observed_data": {"y": ("observation",)},
-        "truth": {"forces": ("at_truth", "force"), "states": ("at_truth", "state"), "decay": ("output",),
-                  "lengthscale": (), "noise_sd": (), "outputs": ("at_truth", "output"),
-                  "deterministics": ("at_truth", "deterministic")},
+        "truth": {"forces": ("time", "force"), "states": ("time", "state"), "decay": ("output",),
+                  "lengthscale": (), "noise_sd": (), "outputs": ("time", "output"),
+                  "deterministics": ("time", "deterministic")},
     }
     assert set(ResultView.of(nuts).groups) == {*expected, "sample_stats"}
     for name, variables in expected.items():
@@ -100,7 +101,7 @@ def test_coordinates_carry_names_times_and_units(nuts, known, y):
     assert (paths["force"].values.tolist(), paths["state"].values.tolist()) == (["drive"], ["x0", "x1"])
     assert (posterior.sizes["draw"], paths.sizes["draw"]) == (40, 5)
     assert set(paths["draw"].values) <= set(posterior["draw"].values)
-    np.testing.assert_array_equal(paths["at"], FORECAST)
+    np.testing.assert_array_equal(paths["time"], FORECAST)
     np.testing.assert_array_equal(observed["y"], y)
     rows, outputs = np.nonzero(np.isfinite(y))
     for name, times in (("data", TIMES), ("one_step_ahead", TIMES), ("log_likelihood", TIMES[rows]),
@@ -373,7 +374,7 @@ def test_panel():
     assert sizes["log_likelihood"] == {"chain": 2, "draw": 10, "observation": 7}
     assert sizes["one_step_ahead"] == {"chain": 2, "draw": 10, "series": 2, "time": 4, "output": 1}
     assert sizes["posterior_predictive"] == {"chain": 2, "draw": 10, "observation": 7}
-    assert sizes["trajectories"] == {"chain": 2, "draw": 2, "series": 2, "at": 2, "force": 1, "state": 1, "output": 1,
+    assert sizes["trajectories"] == {"chain": 2, "draw": 2, "series": 2, "time": 2, "force": 1, "state": 1, "output": 1,
                                      "deterministic": 1, "statistic": 3}
     assert sizes["data"] == {"series": 2, "time": 4, "output": 1} and sizes["observed_data"] == {"observation": 7}
     posterior, ahead = group(result, "posterior"), group(result, "one_step_ahead")["log_density"].values
@@ -434,7 +435,7 @@ def test_times_are_known_to_everything_after_sampling(y):
     result = quiet_fit(converted, TIMES, y[:, :1], sampler="map", samples=4, trajectory_draws=2, at=[0.5, 9.0],
                        model_kwargs=keywords)
     assert set(ResultView.of(result).groups) >= {"trajectories", "log_likelihood", "posterior_predictive"}
-    assert group(result, "trajectories")["forces"].sizes["at"] == 2
+    assert group(result, "trajectories")["forces"].sizes["time"] == 2
     decay = float(group(result, "posterior")["decay"][0, 3])
     values = {"decay": jnp.asarray(decay)}
     with numpyro.handlers.seed(rng_seed=0), numpyro.handlers.substitute(data=values):

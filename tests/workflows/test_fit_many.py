@@ -41,7 +41,7 @@ def draws(result):
 def folder(tmp_path_factory):
     """Three fits, of which one failed, in a folder; and what was yielded."""
     out = tmp_path_factory.mktemp("many")
-    fits = lfm.fit_many(motif.model, poisoned(), out=out, **OPTIONS)
+    fits = lfm.fit_many(motif.model, poisoned(), checkpoint=out, **OPTIONS)
     return out, fits, list(fits)
 
 
@@ -88,7 +88,7 @@ def test_what_is_stored_is_not_fitted_again(folder, monkeypatch):
     out, _, yielded = folder
     fitted, call = [], fit_tasks.FitDataSet.__call__
     monkeypatch.setattr(fit_tasks.FitDataSet, "__call__", lambda fit, task: fitted.append(task.name) or call(fit, task))
-    again = list(lfm.fit_many(motif.model, data_sets(), out=out, **OPTIONS))
+    again = list(lfm.fit_many(motif.model, data_sets(), checkpoint=out, **OPTIONS))
     assert [one.stored for one in again] == [True, True, False] and again[2].name == "plant 1" and len(fitted) == 1
     for name, values in draws(yielded[2].result).items():
         np.testing.assert_array_equal(draws(again[1].result)[name], values)
@@ -117,7 +117,7 @@ def test_results_of_something_else_are_refused(folder, change, message):
     if change.pop("data", 0):
         sets["plant 0"] = sets["plant 2"]
     with pytest.raises(ValueError, match=f"other settings: {message}"):
-        lfm.fit_many(model, sets, out=folder[0], **{**OPTIONS, **change}).run()
+        lfm.fit_many(model, sets, checkpoint=folder[0], **{**OPTIONS, **change}).run()
 
 
 def test_data_and_arguments_of_one_data_set():
@@ -153,7 +153,7 @@ def test_names_become_files_that_differ():
 @pytest.mark.slow
 def test_several_processes_find_the_same_numbers(tmp_path):
     alone = {one.name: draws(one.result) for one in lfm.fit_many(motif.model, data_sets(4), **OPTIONS)}
-    for one in lfm.fit_many(motif.model, data_sets(4), workers=2, out=tmp_path, **OPTIONS):
+    for one in lfm.fit_many(motif.model, data_sets(4), workers=2, checkpoint=tmp_path, **OPTIONS):
         for name, values in draws(one.result).items():
             np.testing.assert_allclose(values, alone[one.name][name], rtol=1e-12)
 

@@ -54,7 +54,7 @@ def test_the_plate_is_a_dimension_of_every_group(result):
         np.testing.assert_array_equal(ResultView.of(result).group(name)["patient"], np.array(LABELS)[series])
         np.testing.assert_array_equal(ResultView.of(result).group(name)["time"], TIMES[series, rows])
     assert ResultView.of(result).group("data")["times"].dims == ("patient", "time")
-    assert ResultView.of(result).group("trajectories")["times"].dims == ("patient", "at")
+    assert ResultView.of(result).group("trajectories")["times"].dims == ("patient", "time")
 
 
 @pytest.mark.parametrize("series", [0, 1])
@@ -65,8 +65,8 @@ def test_a_selected_series_is_smoothed_as_if_alone(result, series):
     np.testing.assert_array_equal(observed["time"], TIMES[series, rows])
     np.testing.assert_array_equal(observed["y"], Y[series, rows])
     assert observed["time"].attrs["units"] == "h"
-    assert paths["at"].size > 100 and (np.diff(paths["at"]) > 0).all()
-    expected = smoothed(series, paths["at"].values).force("drive")
+    assert paths["time"].size > 100 and (np.diff(paths["time"]) > 0).all()
+    expected = smoothed(series, paths["time"].values).force("drive")
     mean, _, high = paths["forces_summary"].sel(force="drive").values
     np.testing.assert_allclose(mean, expected.mean, atol=1e-9)
     np.testing.assert_allclose(high - mean, 1.959964 * expected.sd, rtol=1e-3)

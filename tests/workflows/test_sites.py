@@ -102,14 +102,14 @@ def test_groups_by_site(fitted):
         expected = [likelihood(name, rate, TIMES[name]).log_prob(Y[name]) for rate in rates[:3]]
         np.testing.assert_allclose(terms.sum("time").values.ravel()[:3], expected, atol=1e-10)
     assert "predictions_b" in ResultView.of(fitted).groups and "predictions_a" not in ResultView.of(fitted).groups
-    with pytest.raises(ValueError, match="select_site"):
+    with pytest.raises(ValueError, match="select_series"):
         ResultView.of(fitted).group("trajectories")
 
 
 def test_a_selected_site_is_a_result_of_one_site(fitted, tmp_path):
     lfm.save(fitted, tmp_path / "fit.nc")
     for result in (fitted, lfm.load(tmp_path / "fit.nc")):
-        site = lfm.select_site(result, "b")
+        site = lfm.select_series(result, "b")
         assert set(ResultView.of(site).groups) == {"posterior", "log_prior", "data", "observed_data", "log_likelihood",
                                                 "one_step_ahead", "trajectories", "posterior_predictive",
                                                  "predictions", "data_a"}
@@ -120,14 +120,14 @@ def test_a_selected_site_is_a_result_of_one_site(fitted, tmp_path):
         assert ResultView.of(site).attrs["likelihood"].startswith("exact")
         assert lfm.plot_fit(site) is not None
     with pytest.raises(ValueError, match="'c'"):
-        lfm.select_site(fitted, "c")
+        lfm.select_series(fitted, "c")
 
 
 def test_forecast_and_score_by_site(fitted):
     ahead = lfm.forecast(fitted, both, {"a": [6.0, 7.0]}, progress=False)
     assert ResultView.of(ahead).group("predictions_a")["a"].shape == (1, 40, 2, 1)
     expected = np.exp(-0.4 * np.array([[6.0], [7.0]]))
-    table = lfm.score(lfm.select_site(ahead, "a"), expected)
+    table = lfm.score(lfm.select_series(ahead, "a"), expected)
     assert table.index.tolist() == ["level", "all"] and table.loc["all", "rmse"] < 0.3
     with pytest.raises(ValueError, match="'c'"):
         lfm.forecast(fitted, both, {"c": [6.0]}, progress=False)
@@ -135,10 +135,10 @@ def test_forecast_and_score_by_site(fitted):
 
 def test_a_forecast_of_a_selected_site_is_that_of_all_sites(fitted, tmp_path):
     for name, times in (("a", [6.0, 7.0]), ("b", [2.2, 5.0])):
-        site = lfm.select_site(fitted, name)
+        site = lfm.select_series(fitted, name)
         lfm.save(site, tmp_path / f"{name}.nc")
         alone = lfm.forecast(lfm.load(tmp_path / f"{name}.nc"), both, times, progress=False)
-        expected = lfm.select_site(lfm.forecast(fitted, both, {name: times}, progress=False), name)
+        expected = lfm.select_series(lfm.forecast(fitted, both, {name: times}, progress=False), name)
         xr.testing.assert_allclose(*(ResultView.of(ahead).group("predictions") for ahead in (alone, expected)))
         assert lfm.score(alone, np.zeros((2, len(GAIN[name])))).loc["all", "n"] == 2 * len(GAIN[name])
 
@@ -175,13 +175,13 @@ def test_the_check_adds_the_sites(fitted):
 
 
 def test_report_and_figures_of_a_site(fitted, tmp_path):
-    site = lfm.select_site(fitted, "b")
+    site = lfm.select_series(fitted, "b")
     names = {path.name for path in save_figures(site, tmp_path)}
     assert {"fit.png", "forces.png", "residuals.png", "pairs.png"} <= names
     assert "y1" in lfm.save_report(site, tmp_path, figures=()).read_text()
     for draw in (lfm.plot_fit, lfm.plot_forces, lfm.plot_residuals, lambda result: save_figures(result, tmp_path),
                  lambda result: lfm.save_report(result, tmp_path / "page.html")):
-        with pytest.raises(ValueError, match=r"sites a, b.*select_site\(result, 'a'\)"):
+        with pytest.raises(ValueError, match=r"sites a, b.*select_series\(result, 'a'\)"):
             draw(fitted)
 
 
@@ -213,10 +213,10 @@ def test_known_inputs_reach_their_site():
     longer = lfm.Input(np.array([0.0, 2.0, 7.0]), np.array([0.5, 0.0, 1.0]))
     ahead = lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"a": {"heat": longer}}, progress=False)
     assert {"predictions_a", "predictions_constant_data_a"} <= set(ResultView.of(ahead).groups)
-    alone = lfm.forecast(lfm.select_site(result, "a"), heated, [6.0, 7.0], inputs={"heat": longer}, progress=False)
+    alone = lfm.forecast(lfm.select_series(result, "a"), heated, [6.0, 7.0], inputs={"heat": longer}, progress=False)
     assert "predictions_constant_data" in ResultView.of(alone).groups
     xr.testing.assert_allclose(*(ResultView.of(view).group("predictions")["y"]
-                                 for view in (alone, lfm.select_site(ahead, "a"))))
+                                 for view in (alone, lfm.select_series(ahead, "a"))))
     with pytest.raises(ValueError, match="inputs: unknown likelihood site 'heat'.*a, b"):
         lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"heat": longer}, progress=False)
 

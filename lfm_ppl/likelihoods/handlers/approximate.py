@@ -18,7 +18,7 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
     """Effect handler that replaces settings of the likelihood, such as the linearisation rule.
 
     Args:
-        fn: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
+        numpyro_model: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
         **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping``, ``tolerance``, ``method``,
             ``factors``, ``lower``, ``upper``, ``constraints``, ``grid`` and ``draws``; what is None or left out
             stays as the model has it. But ``steps`` or ``iterations`` without a tolerance remove the tolerance of the
@@ -43,12 +43,12 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         20
     """
 
-    def __init__(self, fn: Callable[..., Any] | None = None, **settings: Any) -> None:
+    def __init__(self, numpyro_model: Callable[..., Any] | None = None, **settings: Any) -> None:
         unknown = sorted(set(settings) - set(NAMES))
         if unknown:
             raise TypeError(f"unknown setting {unknown[0]!r}; known: {', '.join(NAMES)}.")
         self.settings = {name: value for name, value in settings.items() if value is not None}
-        super().__init__(fn)
+        super().__init__(numpyro_model)
 
     def missing(self) -> str:
         """Return the error of a model without a likelihood whose settings could be changed."""

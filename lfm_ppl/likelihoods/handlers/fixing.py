@@ -30,7 +30,7 @@ class fix(Handler):  # noqa: N801 (an effect handler, named as NumPyro names its
     """Effect handler that fixes parameters.
 
     Args:
-        fn: the NumPyro model.
+        numpyro_model: the NumPyro model.
         fixed: name -> value. ``decay`` fixes the whole site (a number is repeated to its shape);
             ``decay[CDKN1A]`` or ``decay[2]`` fixes one element of a vector site, by label or by
             index from zero.
@@ -54,14 +54,14 @@ class fix(Handler):  # noqa: N801 (an effect handler, named as NumPyro names its
 
     def __init__(
         self,
-        fn: Callable[..., Any] | None = None,
+        numpyro_model: Callable[..., Any] | None = None,
         fixed: Mapping[str, ArrayLike] | None = None,
         labels: Sequence[str] = (),
     ) -> None:
         self.whole, self.elements = _split(fixed or {})
         self.labels = tuple(labels)
         self.sites: dict[str, bool] = {}
-        super().__init__(fn)
+        super().__init__(numpyro_model)
 
     def begin(self) -> None:
         """Forget the sites of the run before."""

@@ -56,7 +56,7 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
     `numpyro.infer.MCMC`; `lfm_ppl.EllipticalSlice` works on it where all other sites are conditioned on.
 
     Args:
-        fn: a NumPyro model with a site ``lfm.MarginalLikelihood``.
+        numpyro_model: a NumPyro model with a site ``lfm.MarginalLikelihood``.
         points: number of points, or the grid; as in `lfm_ppl.LatentGrid`.
         quadrature: "riemann", "trapezoid" or "linear".
 
@@ -80,11 +80,11 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
 
     supports_all_likelihoods = False
 
-    def __init__(self, fn: Callable[..., Any] | None = None, points: ArrayLike = 363,
+    def __init__(self, numpyro_model: Callable[..., Any] | None = None, points: ArrayLike = 363,
                  quadrature: str = "linear") -> None:
         checks.one_of("quadrature", quadrature, QUADRATURES)
         self.points, self.quadrature = points, quadrature
-        super().__init__(fn)
+        super().__init__(numpyro_model)
 
     def missing(self) -> str:
         """Return the error of a model without forces that could be put on a grid."""

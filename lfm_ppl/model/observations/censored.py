@@ -25,33 +25,33 @@ class CensoredObservation(ObservationFamily):
 
     Args:
         function: ``h(x, u, t) -> (D,)``, f.
-        scale: s > 0: a number, (D,) or (T, D); it may be sampled.
+        sd: s > 0: a number, (D,) or (T, D); it may be sampled.
         left: lower limit, -inf for none: a number, (D,) or (T, D).
         right: upper limit, inf for none; shapes as for ``left``.
         width: width of the bins, 0 where values are reported exactly; shapes as for ``left``.
 
     Raises:
-        ValueError: the scale is not positive, the width is negative, or the lower limit is not below the upper limit.
+        ValueError: the sd is not positive, the width is negative, or the lower limit is not below the upper limit.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> family = CensoredObservation(lambda x, u, t: x, 1.0, left=0.0)
+        >>> family = CensoredObservation(lambda x, u, t: x, sd=1.0, left=0.0)
         >>> family.log_prob(jnp.zeros(2), jnp.array([0.0, 1.0])).round(4).tolist()
         [-0.6931, -1.4189]
 
     Source: Tobin (1958), Econometrica 26.
     """
 
-    scale: jax.Array
+    sd: jax.Array
     left: jax.Array
     right: jax.Array
     width: jax.Array
-    per_entry: ClassVar[tuple[str, ...]] = ("scale", "left", "right", "width")
+    per_entry: ClassVar[tuple[str, ...]] = ("sd", "left", "right", "width")
 
-    def __init__(self, function: Callable[..., jax.Array], scale: Any, left: Any = -np.inf, right: Any = np.inf,
+    def __init__(self, function: Callable[..., jax.Array], sd: Any, left: Any = -np.inf, right: Any = np.inf,
                  width: Any = 0.0):
         self.function = function
-        self.scale = as_parameter("scale", scale)
+        self.sd = as_parameter("sd", sd)
         self.left, self.right, self.width = (jnp.asarray(checks.unmask(value), float) for value in (left, right, width))
         lower, upper, bin_width = (checks.concrete(value) for value in (self.left, self.right, self.width))
         if lower is not None and upper is not None and not np.all(lower < upper):
@@ -61,7 +61,7 @@ class CensoredObservation(ObservationFamily):
 
     def log_prob(self, predictor: jax.Array, y: jax.Array) -> jax.Array:
         """Return the log density of exact values, the log probability of limits and bins, (D,)."""
-        s = self.scale
+        s = self.sd
         half = 0.5 * jnp.where(self.width > 0, self.width, s)
         error = (y - predictor) / s
         uncensored = jnp.where(self.width > 0, _log_probability_between(error - half / s, error + half / s),
@@ -84,12 +84,12 @@ class CensoredObservation(ObservationFamily):
         low, high = self._limits(y)
         half = 0.5 * self.width
         lower, upper = jnp.where(y >= self.right, high, y - half), jnp.where(y <= self.left, low, y + half)
-        below, up_to = norm.cdf((lower - predictor) / self.scale), norm.cdf((upper - predictor) / self.scale)
+        below, up_to = norm.cdf((lower - predictor) / self.sd), norm.cdf((upper - predictor) / self.sd)
         return jnp.where(y <= self.left, 0.0, below), jnp.where(y >= self.right, 1.0, up_to)
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw measurements (D,), binned and limited as the data are."""
-        value = predictor + self.scale * jax.random.normal(key, predictor.shape)
+        value = predictor + self.sd * jax.random.normal(key, predictor.shape)
         width = jnp.where(self.width > 0, self.width, 1.0)
         value = jnp.where(self.width > 0, jnp.round(value / width) * width, value)
         return jnp.clip(value, self.left, self.right)

@@ -40,18 +40,25 @@ class _CountObservation(ObservationFamily):
         _, log_rate = RATES[self.link]
         return log_rate(predictor) + jnp.log(self.exposure)
 
-    def _where_positive(self, log_mean: jax.Array, value: jax.Array) -> jax.Array:
-        """Return a log probability, -inf where the predictor is not positive under the identity link."""
-        return jnp.where(jnp.isneginf(log_mean), -jnp.inf, value) if self.link == "identity" else value
+    def _where_possible(self, predictor: jax.Array, y: jax.Array, value: jax.Array, of_zero: jax.Array) -> jax.Array:
+        """Return the log probability of a count at every predictor of the identity link; ``value`` for other links.
+
+        It is -inf below zero. At zero, where the log mean of ``value`` is -inf, a count of zero has the log probability
+        ``of_zero``, whose derivative is the right one, and any other count is impossible.
+        """
+        if self.link != "identity":
+            return value
+        at_zero = jnp.where(y == 0, of_zero, -jnp.inf)
+        return jnp.where(predictor > 0, value, jnp.where(predictor == 0, at_zero, -jnp.inf))
 
     def problem(self, y: np.ndarray) -> tuple[np.ndarray, str]:
         """Return which data are not counts, and the requirement."""
         return is_not_count(y), "counts: whole numbers of at least zero"
 
     def overflows(self, predictor: np.ndarray) -> np.ndarray:
-        """Return whether the mean is not finite, or not positive under the identity link, (D,)."""
+        """Return whether the mean is not finite, or negative under the identity link, (D,)."""
         mean = np.asarray(self.mean(jnp.asarray(predictor, float)))
-        return ~np.isfinite(mean) | ((mean <= 0) & (self.link == "identity"))
+        return ~np.isfinite(mean) | (mean < 0)
 
 
 class PoissonObservation(_CountObservation):
@@ -61,7 +68,8 @@ class PoissonObservation(_CountObservation):
 
     Args:
         function: ``h(x, u, t) -> (D,)``, the predictor f.
-        link: g: "exp", "softplus" or "identity" (the predictor is then the rate itself, and must be positive).
+        link: g: "exp", "softplus" or "identity" (the predictor is then the rate itself, and must not be negative; where
+            it is zero, the count is zero).
         exposure: E, the length of time, population or similar to which the rate refers: a number, (D,) or (T, D).
 
     Raises:
@@ -83,7 +91,8 @@ class PoissonObservation(_CountObservation):
         log_mean, reference = self._log_mean(predictor), jnp.where(y > 0, y, 1.0)
         log_ratio = log_mean - jnp.log(reference)
         at_reference = jnp.where(y > 0, -stirling_error(reference) - 0.5 * (LOG_2PI + jnp.log(reference)), -1.0)
-        return self._where_positive(log_mean, at_reference + y * log_ratio - reference * jnp.expm1(log_ratio))
+        value = at_reference + y * log_ratio - reference * jnp.expm1(log_ratio)
+        return self._where_possible(predictor, y, value, -self.mean(predictor))
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw counts (D,)."""
@@ -134,7 +143,7 @@ class NegativeBinomialObservation(_CountObservation):
         sign, factor = jnp.where(is_large_c, 1.0, -1.0), jnp.where(is_large_c, y, c)
         share = jnp.minimum(reference, c) / (reference + c)
         value = at_reference + sign * factor * log_ratio - (y + c) * _log_mixture(share, sign * log_ratio)
-        return self._where_positive(log_mean, value)
+        return self._where_possible(predictor, y, value, -c * jnp.log1p(self.mean(predictor) / c))
 
     def sample(self, key: jax.Array, predictor: jax.Array) -> jax.Array:
         """Draw counts (D,)."""

@@ -45,8 +45,8 @@ class Observations(ObservationFamily):
     r"""Observations of several families: their entries are concatenated.
 
     Args:
-        *parts: observation families; a `lfm_ppl.GaussianObservation` with variances (D,) is allowed. The columns of y
-            belong to the first part, then to the second part, and so on.
+        *parts: observation families; a `lfm_ppl.GaussianObservation` with sd or variances (D,) is allowed. The columns
+            of y belong to the first part, then to the second part, and so on.
 
     Raises:
         TypeError: a part is not an observation.
@@ -163,7 +163,7 @@ def _as_family(index: int, part: Any) -> ObservationFamily:
     if not isinstance(part, GaussianObservation):
         raise TypeError(f"part {index} of Observations must be an observation, such as lfm.PoissonObservation("
                         f"function), got {type(part).__name__}.")
-    if part.varies_with_state or part.covariance.ndim != 1 or part.angular:
-        raise ValueError(f"part {index} of Observations is Gaussian and needs variances (D,) that are numbers, and no "
-                         "angles, since entries are independent given the predictor.")
+    if part.varies_with_state or part.covariance.ndim > 1 or part.angular:
+        raise ValueError(f"part {index} of Observations is Gaussian and needs sd (D,) or variances that are numbers, "
+                         "and no angles, since entries are independent given the predictor.")
     return _GaussianFamily(part.function, part.covariance)
