@@ -28,6 +28,7 @@ from lfm_ppl.forces.stretched import Stretched
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.inference.trajectories import evenly_spaced
+from lfm_ppl.inference.tuning import finite_sd
 from lfm_ppl.likelihoods.constrained_likelihood import ConstrainedLikelihood
 from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
@@ -64,7 +65,8 @@ def more_iterations(example: SeriesLikelihood) -> Refinement | None:
     if example.has_factors or example.ssm.plan.is_linear or not example.has_gaussian_state:
         return None
     current = example.settings.iterations
-    count = DEFAULT_ITERATIONS if current < DEFAULT_ITERATIONS else max(_MANY_ITERATIONS, 2 * current)
+    is_short = current < DEFAULT_ITERATIONS and example.about is None
+    count = DEFAULT_ITERATIONS if is_short else max(_MANY_ITERATIONS, 2 * current)
     return Refinement({"iterations": count}, f"{count} iterations of posterior linearisation instead of {current}",
                       f"iterations={count} (--iterations {count})")
 
@@ -119,11 +121,6 @@ def resolution_warnings(site: LikelihoodSite) -> list[str]:
     first, y = site.example, np.asarray(site.observed)
     rows = y[0] if site.distribution.batch_shape else y
     return [*_long_steps(first), *resolution_messages(first.model, first.times, rows)]
-
-
-def finite_sd(values: np.ndarray) -> float:
-    """Return the standard deviation; infinite where a value is not finite."""
-    return float(values.std()) if np.isfinite(values).all() else np.inf
 
 
 def _long_steps(likelihood: SeriesLikelihood) -> list[str]:

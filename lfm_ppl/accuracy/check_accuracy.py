@@ -23,7 +23,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.accuracy import importance_weights, log_likelihoods
-from lfm_ppl.accuracy.approximation import finite_sd, more_iterations
+from lfm_ppl.accuracy.approximation import more_iterations
 from lfm_ppl.accuracy.log_likelihoods import Reference, ReferenceSettings
 from lfm_ppl.accuracy.report import EXACT, GROUP, AccuracyReport
 from lfm_ppl.accuracy.verdict import NOISE_SD, NOISE_SHARE, Findings, judge
@@ -31,6 +31,7 @@ from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.inference.samplers import GAUSSIAN_FILTER_SAMPLERS, SAMPLERS
 from lfm_ppl.inference.trajectories import evenly_spaced
+from lfm_ppl.inference.tuning import finite_sd
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.results import arviz_data, rebuilding

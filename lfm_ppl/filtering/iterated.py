@@ -14,7 +14,9 @@ r"""Iterated posterior linearisation: smooth, linearise about the smoothed margi
    a linear model smoothed variances never exceed them. Where a path crosses an unstable point they do: the linearised
    flow grows between two observations, as the model's own does not, and rules that average over such a variance give
    rates that explicit steps do not resolve.
-5. The caller makes the final forward pass about the result: n iterations are n forward and n backward scans, and one
+5. Iterations may start from smoothed moments at another point of the parameters (`Anchor`) instead of from a first
+   pass. Step 4 then takes the share of the variance of each pass that was its limit at that point.
+6. The caller makes the final forward pass about the result: n iterations are n forward and n backward scans, and one
    forward scan more.
 
 The gradient is that of the unrolled iterations, since a fixed number of them is a smooth function of the parameters.
@@ -24,14 +26,16 @@ Source: García-Fernández, Svensson and Särkkä (2017), IEEE Transactions on S
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lfm_ppl.filtering.backward import SmootherTrace, at_interval_starts, backward
 from lfm_ppl.filtering.dynamics import columns, linearization_indices
 from lfm_ppl.filtering.forward import FilterTrace, LinearizationPoints, forward
+from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.predict import NodeRecord
 from lfm_ppl.filtering.problem import FilterProblem
@@ -43,20 +47,70 @@ from lfm_ppl.utils.linalg import congruence, safe_sqrt
 DEFAULT_ITERATIONS = 3
 """Iterations of posterior linearisation of models that are not linear."""
 
+_MOST_ITERATIONS, _SETTLED = 100, 1e-9
+"""Iterations of an anchor, and the change of its means, in standard deviations, below which they end."""
+
 _NEGLIGIBLE_STEP = 1e-8
 """Square of a step, in standard deviations, below which the secant method has no information."""
+
+
+class Anchor(NamedTuple):
+    """Smoothed moments at one point of the parameters, from which the iterations at other points start.
+
+    Attributes:
+        since, length: (N,) starts of the intervals, counted from the initial time, and their lengths.
+        points: moments about which the first pass is linearised.
+        variance_share: (N, J + 1, k), share of the variance that a pass predicts at the nodes, to which step 4 limits
+            the variances there; None where nodes are not recorded.
+    """
+
+    since: jax.Array
+    length: jax.Array
+    points: LinearizationPoints
+    variance_share: jax.Array | None
+
+    def on_grid(self, grid: TimeGrid, is_own: bool = False) -> Anchor:
+        """Return the moments at the nodes of another time grid, interpolated within the intervals.
+
+        Args:
+            grid: the time grid.
+            is_own: whether it has the times for which the moments were computed, and no requested ones.
+        """
+        count, steps = np.shape(self.points.nodes.mean)[0], np.shape(self.points.nodes.mean)[1] - 1
+        # Distinct lengths are known where no interval ends at a time that depends on the parameters.
+        if is_own and grid.lengths is not None and (count, steps) == (np.shape(grid.intervals.length)[0], grid.steps):
+            return self
+        since, length = jnp.asarray(grid.since), jnp.asarray(grid.intervals.length)
+        # The interval of the anchor in which an interval of the grid lies: a jump is at its end.
+        row = jnp.searchsorted(self.since + self.length, since + 0.5 * length)
+        row = jnp.minimum(row, count - 1)
+        fractions = jnp.linspace(0.0, 1.0, grid.steps + 1)
+        position = (since - self.since[row])[:, None] + length[:, None] * fractions
+        own_length = self.length[row][:, None]
+        is_empty = own_length <= 0.0
+        position = steps * jnp.clip(position / jnp.where(is_empty, 1.0, own_length), 0.0, 1.0)
+        lower = jnp.minimum(position.astype(int), steps - 1)
+
+        def interpolate(a: jax.Array) -> jax.Array:
+            weight = (position - lower).reshape(position.shape + (1,) * (a.ndim - 2))
+            return (1.0 - weight) * a[row[:, None], lower] + weight * a[row[:, None], lower + 1]
+
+        nodes, share = jax.tree.map(interpolate, (self.points.nodes, self.variance_share))
+        end_moments = jax.tree.map(lambda a: a[row], self.points.end_moments)
+        return Anchor(since, length, LinearizationPoints(nodes, end_moments), share)
 
 
 class IterationResult(NamedTuple):
     """Result of the iterations.
 
     Attributes:
-        points: moments about which the last pass is linearised.
-        change: largest change of a mean in the last iteration, in standard deviations; NaN with one iteration.
-        log_likelihood: of the pass of the last iteration, about the points before the last ones; NaN with one.
+        points: moments about which the last pass is linearised; None: the filter's.
+        change: largest change of a mean in the last iteration, in standard deviations; NaN with fewer than two.
+        log_likelihood: of the pass of the last iteration, about the points before the last ones; NaN with fewer than
+            two.
     """
 
-    points: LinearizationPoints
+    points: LinearizationPoints | None
     change: jax.Array
     log_likelihood: jax.Array
 
@@ -77,6 +131,29 @@ class _Iterate(NamedTuple):
     change: jax.Array
 
 
+class _State(NamedTuple):
+    """State of the iterations.
+
+    Attributes:
+        iterates: at the nodes and, where the observation is not linear, at the intervals' ends.
+        log_likelihood: of the last pass; NaN before the first one.
+    """
+
+    iterates: tuple[_Iterate, _Iterate | None]
+    log_likelihood: jax.Array
+
+    @property
+    def points(self) -> LinearizationPoints:
+        """The moments of the iterates."""
+        nodes, end_moments = self.iterates
+        return LinearizationPoints(nodes.moments, None if end_moments is None else end_moments.moments)
+
+    @property
+    def change(self) -> jax.Array:
+        """Largest change of a mean in the last iteration, in standard deviations."""
+        return jnp.max(jnp.stack([iterate.change for iterate in self.iterates if iterate is not None]))
+
+
 def number_of_iterations(iterations: int | None, ssm: StateSpaceModel, tolerance: float | None) -> int:
     """Return the number of iterations of the smoother and of the likelihood, the default for None.
 
@@ -88,42 +165,117 @@ def number_of_iterations(iterations: int | None, ssm: StateSpaceModel, tolerance
     return 0 if is_family or tolerance is not None or ssm.plan.is_linear else DEFAULT_ITERATIONS
 
 
-def posterior_linearisation(problem: FilterProblem, updater: Updater, iterations: int,
-                            damping: float) -> IterationResult:
+def posterior_linearisation(problem: FilterProblem, updater: Updater, iterations: Any, damping: float,
+                            anchor: Anchor | None = None) -> IterationResult:
     """Return the moments after a fixed number of iterations, so that they are smooth in the parameters.
 
     Args:
         problem: the model, the rule and the time grid.
         updater: how observations update the moments.
-        iterations: number of forward and backward scans.
+        iterations: number of backward scans; a traced one, from an anchor, leaves no derivative in reverse mode.
         damping: largest fraction of the new marginals that is taken, in (0, 1].
+        anchor: moments on this grid to start from; None: the filter's.
+
+    Raises:
+        ValueError: the anchor has moments of other states.
     """
-    def smooth(trace: FilterTrace) -> LinearizationPoints:
-        return smoothed_points(problem, trace, backward(problem, trace, adjoint_only=True))
+    unknown = jnp.asarray(jnp.nan)
+    if anchor is None and isinstance(iterations, int) and iterations == 0:
+        return IterationResult(None, unknown, unknown)
+    if anchor is not None:
+        _check_states(problem, anchor)
+    state, largest = _first_state(problem, updater, damping, anchor)
+    count = iterations - 1 if anchor is None else iterations
+    if not (isinstance(count, int) and count == 0):
+        share = None if anchor is None else anchor.variance_share
+        # With a fixed count this is a scan, which has a derivative in reverse mode.
+        state = jax.lax.fori_loop(0, count, lambda _, state: _iterate(
+            problem, updater, damping, state, largest, share), state)
+    if isinstance(iterations, int) and iterations < 2:
+        return IterationResult(state.points, unknown, unknown)
+    return IterationResult(state.points, state.change, state.log_likelihood)
 
-    single_pass = forward(problem, updater, record=Record.LINEARIZATION)
-    largest = predicted_variance(problem, single_pass)
 
-    def limit(nodes: _Iterate) -> _Iterate:
-        return nodes if largest is None else nodes._replace(moments=limit_variance(nodes.moments, largest))
+def converged_anchor(problem: FilterProblem, updater: Updater, damping: float, anchor: Anchor | None = None) -> Anchor:
+    """Return the moments after as many iterations as they change; it has no derivative in reverse mode.
 
-    def iterate(iterates: list[_Iterate | None], _: None) -> tuple[list[_Iterate | None], jax.Array]:
-        trace = forward(problem, updater, about=_points_of(iterates), record=Record.LINEARIZATION)
-        smoothed = smooth(trace)
-        nodes, end_moments = (None if old is None or new is None else _damped_update(old, new, damping)
-                              for old, new in zip(iterates, smoothed, strict=True))
-        assert nodes is not None
-        return [limit(nodes), end_moments], trace.log_likelihood.sum()
+    Args:
+        problem: the model, the rule and the time grid.
+        updater: how observations update the moments.
+        damping: largest fraction of the new marginals that is taken, in (0, 1].
+        anchor: moments on this grid to start from; None: the filter's.
+    """
+    state, largest = _first_state(problem, updater, damping, anchor)
+    share = None if anchor is None else anchor.variance_share
 
-    nodes, end_moments = (
-        None if moments is None else _Iterate(moments, jnp.zeros_like(moments.mean),
-                                              jnp.full(moments.mean.shape[:-1], damping), jnp.asarray(jnp.nan))
-        for moments in smooth(single_pass))
-    assert nodes is not None
-    last, log_likelihoods = jax.lax.scan(iterate, [limit(nodes), end_moments], None, length=iterations - 1)
-    change = jnp.max(jnp.stack([iterate.change for iterate in last if iterate is not None]))
-    log_likelihood = log_likelihoods[-1] if iterations > 1 else jnp.asarray(jnp.nan)
-    return IterationResult(_points_of(last), change, log_likelihood)
+    def is_moving(counted: tuple[jax.Array, _State]) -> jax.Array:
+        count, state = counted
+        return (count < _MOST_ITERATIONS) & ~(state.change < _SETTLED)
+
+    def iterate(counted: tuple[jax.Array, _State]) -> tuple[jax.Array, _State]:
+        count, state = counted
+        return count + 1, _iterate(problem, updater, damping, state, largest, share)
+
+    _, state = jax.lax.while_loop(is_moving, iterate, (jnp.asarray(0), state))
+    grid = jnp.asarray(problem.grid.since, float), jnp.asarray(problem.grid.intervals.length, float)
+    if anchor is not None or largest is None:
+        return Anchor(*grid, state.points, share)
+    predicted = predicted_variance(problem, forward(problem, updater, about=state.points, record=Record.LINEARIZATION))
+    assert predicted is not None
+    is_known = predicted <= 0.0
+    return Anchor(*grid, state.points, jnp.where(is_known, 1.0, largest / jnp.where(is_known, 1.0, predicted)))
+
+
+def _check_states(problem: FilterProblem, anchor: Anchor) -> None:
+    expected = len(linearization_indices(problem.ssm, problem.rule))
+    if (count := np.shape(anchor.points.nodes.mean)[-1]) != expected:
+        raise ValueError(f"about has moments of {count} states, and this model with this rule is linearised about "
+                         f"{expected}; take the anchor of a likelihood of the same model and rule.")
+
+
+def _first_state(problem: FilterProblem, updater: Updater, damping: float,
+                 anchor: Anchor | None) -> tuple[_State, jax.Array | None]:
+    """Return the moments of an anchor, or those after a first pass with the variances that limit all later ones."""
+    largest = None
+    if anchor is None:
+        single_pass = forward(problem, updater, record=Record.LINEARIZATION)
+        largest = predicted_variance(problem, single_pass)
+        points = _smoothed(problem, single_pass)
+        if largest is not None:
+            points = points._replace(nodes=limit_variance(points.nodes, largest))
+    else:
+        points = anchor.points
+
+    def first(moments: Moments) -> _Iterate:
+        return _Iterate(moments, jnp.zeros_like(moments.mean), jnp.full(moments.mean.shape[:-1], damping),
+                        jnp.asarray(jnp.nan))
+
+    iterates = first(points.nodes), None if points.end_moments is None else first(points.end_moments)
+    return _State(iterates, jnp.asarray(jnp.nan)), largest
+
+
+def _iterate(problem: FilterProblem, updater: Updater, damping: float, state: _State, largest: jax.Array | None,
+             variance_share: jax.Array | None) -> _State:
+    """Return the state after one iteration.
+
+    Variances at the nodes are at most ``largest``, or the share of those that the pass predicts.
+    """
+    trace = forward(problem, updater, about=state.points, record=Record.LINEARIZATION)
+    if variance_share is not None and (predicted := predicted_variance(problem, trace)) is not None:
+        largest = variance_share * predicted
+    smoothed = _smoothed(problem, trace)
+    nodes, end_moments = state.iterates
+    nodes = _damped_update(nodes, smoothed.nodes, damping)
+    if largest is not None:
+        nodes = nodes._replace(moments=limit_variance(nodes.moments, largest))
+    if end_moments is not None:
+        assert smoothed.end_moments is not None
+        end_moments = _damped_update(end_moments, smoothed.end_moments, damping)
+    return _State((nodes, end_moments), trace.log_likelihood.sum())
+
+
+def _smoothed(problem: FilterProblem, trace: FilterTrace) -> LinearizationPoints:
+    return smoothed_points(problem, trace, backward(problem, trace, adjoint_only=True))
 
 
 def predicted_variance(problem: FilterProblem, single_pass: FilterTrace) -> jax.Array | None:
@@ -151,12 +303,6 @@ def limit_variance(moments: Moments, largest: jax.Array) -> Moments:
     ratio = jnp.where(is_above, largest, 1.0) / jnp.where(is_above, variance, 1.0)
     factor = jnp.where(is_above, safe_sqrt(ratio), 1.0)
     return moments._replace(covariance=factor[..., :, None] * moments.covariance * factor[..., None, :])
-
-
-def _points_of(iterates: list[_Iterate | None]) -> LinearizationPoints:
-    nodes, end_moments = (None if iterate is None else iterate.moments for iterate in iterates)
-    assert nodes is not None
-    return LinearizationPoints(nodes, end_moments)
 
 
 def _damped_update(old: _Iterate, smoothed: Moments, damping: float) -> _Iterate:

@@ -29,7 +29,7 @@ from lfm_ppl.filtering.filter import whitened_innovations
 from lfm_ppl.filtering.forward import FilterTrace, forward
 from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS
 from lfm_ppl.filtering.intervals import TimeGrid
-from lfm_ppl.filtering.iterated import number_of_iterations, posterior_linearisation
+from lfm_ppl.filtering.iterated import Anchor, number_of_iterations, posterior_linearisation
 from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
 from lfm_ppl.filtering.sample import sample_errors
@@ -171,7 +171,7 @@ def _sample(result: SmootherResult, key: jax.Array, draws: int) -> Trajectories:
 def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule | None = None, steps: int = 10,
            max_step: float | None = None, at: ArrayLike | None = None, iterations: int | None = None,
            damping: float = 0.7, tolerance: float | None = None, factors: FactorSettings | str | None = None,
-           method: str = DEFAULT_METHOD) -> SmootherResult:
+           method: str = DEFAULT_METHOD, about: Anchor | None = None) -> SmootherResult:
     """Smooth: the state and the forces given all observations.
 
         m_s = m + G (m_s+ - m_p),  P_s = (I - G Phi) P (I - G Phi)' + G (Q + P_s+) G',  G = P Phi' P_p^-1.
@@ -194,6 +194,8 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
         factors: of an observation family, how its factors are refined: "ep" (the default), "variational", "laplace", or
             `lfm_ppl.FactorSettings`.
+        about: smoothed moments from which the iterations start, as in `lfm_ppl.MarginalLikelihood`; at requested times
+            they are interpolated.
 
     Returns:
         Moments at the requested times, forces by name, draws of trajectories, diagnostics.
@@ -227,7 +229,8 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
     check_resolution(model, times, y)
     y = check_observations(y, len(grid.observed), ssm.output_dim, model=model)
     warn_single_precision()
-    result = _compiled_smooth(ssm, rule, grid, y, iterations, damping, settings)
+    about = None if about is None or ssm.plan.is_linear else about.on_grid(grid, at is None)
+    result = _compiled_smooth(ssm, rule, grid, y, iterations, damping, settings, about)
     warn_of_breakdown(ssm, rule, grid, y, None, result.log_likelihood, settings, result.converged)
     if not isinstance(model.observation, ObservationFamily):
         warn_of_iterations(result.change, result.log_likelihood_change)
@@ -241,13 +244,13 @@ def filtered_mean(result: SmootherResult, grid: TimeGrid) -> jax.Array:
 
 
 def smooth_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, iterations: int, damping: float,
-              settings: FactorSettings) -> SmootherResult:
+              settings: FactorSettings, about: Anchor | None = None) -> SmootherResult:
     """Smooth on the intervals of a time grid, without checks; for compiled code."""
     problem = filter_problem(ssm, rule, grid)
     if isinstance(ssm.model.observation, ObservationFamily):
         trace, moments, diagnostics = _smooth_family(problem, y, settings, ssm.model.observation)
     else:
-        trace, moments, diagnostics = _smooth_gaussian(problem, y, iterations, damping)
+        trace, moments, diagnostics = _smooth_gaussian(problem, y, iterations, damping, about)
     times = jnp.asarray(grid.requested_times, float)
     requested = jnp.asarray(grid.requested)
     mean, covariance = (a[requested + 1] for a in moments)
@@ -258,13 +261,11 @@ def smooth_on(ssm: StateSpaceModel, rule: Rule, grid: TimeGrid, y: jax.Array, it
         force_names=ssm.model.force_names)
 
 
-def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int,
-                     damping: float) -> tuple[FilterTrace, Moments, dict[str, jax.Array]]:
+def _smooth_gaussian(problem: FilterProblem, y: jax.Array, iterations: int, damping: float,
+                     about: Anchor | None) -> tuple[FilterTrace, Moments, dict[str, jax.Array]]:
     """Return the forward pass, the smoothed moments and the diagnostics, fields of the result by name."""
-    updater, points, change = GaussianUpdate(y), None, jnp.asarray(jnp.nan)
-    previous = change
-    if iterations:
-        points, change, previous = posterior_linearisation(problem, updater, iterations, damping)
+    updater = GaussianUpdate(y)
+    points, change, previous = posterior_linearisation(problem, updater, iterations, damping, about)
     trace = forward(problem, updater, about=points, record=Record.SMOOTHER)
     smoothed = backward(problem, trace)
     at_data, left_out, entries = at_intervals(

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Collection, Hashable, Mapping
 from typing import Any
 
 import jax
@@ -20,6 +20,7 @@ from numpyro.infer import init_to_median, init_to_sample
 
 from lfm_ppl.filtering.breakdown import warn_of_iterations
 from lfm_ppl.filtering.filter import FilterResult
+from lfm_ppl.filtering.iterated import Anchor
 from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.stiffness import ExplicitSteps, long_step_message, warn_of_message
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
@@ -29,6 +30,7 @@ from lfm_ppl.likelihoods.handlers.approximate import approximate
 from lfm_ppl.likelihoods.handlers.fixing import fix
 from lfm_ppl.likelihoods.likelihood import Likelihood
 from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite, likelihood_sites, remove_likelihood, single_site
+from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.likelihoods.panel import Panel
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.programs import Program
@@ -80,7 +82,11 @@ class BoundModel:
         problem: data, times and inputs as the argument of each program.
         model_data: the data of all sites.
         constants: the same with times and inputs as constants, for functions that need their values.
+        anchor_point: (d,), unconstrained parameters at whose smoothed moments the iterations start, see `anchored`;
+            None: they start from the filter's.
     """
+
+    anchor_point: np.ndarray | None = None
 
     def __init__(self, traced: TracedModel, constants: Problem, problem: Problem, programs: Programs,
                  selected: str | None = None) -> None:
@@ -136,6 +142,7 @@ class BoundModel:
         """Return the same model with other data or another selected site."""
         bound = BoundModel(self.traced, constants, problem, self.programs, selected)
         bound._modifications, bound._layouts = self._modifications, self._layouts
+        bound.anchor_point = self.anchor_point
         return bound
 
     @property
@@ -158,7 +165,9 @@ class BoundModel:
         Raises:
             ValueError: the model has no such site, or several.
         """
-        return single_site(self.traced.likelihoods, self._selected)
+        site = single_site(self.traced.likelihoods, self._selected)
+        anchor = self.constants.anchors.get(site.name)
+        return site if anchor is None else site._replace(distribution=site.distribution.with_about(anchor))
 
     @property
     def has_likelihood(self) -> bool:
@@ -181,7 +190,7 @@ class BoundModel:
             return self._with_checked_data(y)
         arguments, keywords = self.constants.call()
         return BoundModel.of(self.model, (*arguments[:-1], y), keywords, self.traced.caller, self.programs,
-                             self._selected)
+                             self._selected)._anchored_as(self)
 
     def _with_checked_data(self, y: Any) -> BoundModel:
         """Return the same model with other data that are an argument of its programs."""
@@ -487,6 +496,58 @@ class BoundModel:
         self._warn_of_long_steps(result.log_likelihood, z, y, at)
         return result
 
+    def anchor(self, z: ArrayLike | Mapping[str, Any], y: ArrayLike | None = None) -> Anchor:
+        """Return the converged smoothed moments at parameters, ``about`` of `lfm_ppl.MarginalLikelihood`.
+
+        Those of the series of a panel have a leading axis (B,), as `lfm_ppl.panel` takes them.
+
+        Args:
+            z: (d,), or site name -> value; best the posterior mode.
+            y: as in `log_density`.
+
+        Raises:
+            ValueError: an observation family, a tolerance, constraints or regimes, which take no such moments.
+        """
+        if not isinstance(self.site.example, MarginalLikelihood):
+            raise ValueError("smoothed moments to start from are for lfm.MarginalLikelihood and lfm.panel, without "
+                             "constraints and regimes.")
+        return self._run_at("anchor", lambda site, _: site.distribution.mapped(
+            lambda series, y: series.anchor(y), site.observed), z, y, None)
+
+    def anchored(self, z: ArrayLike, sites: Collection[str] | None = None) -> BoundModel:
+        """Return the same model whose iterations start from the converged smoothed moments at z (d,), see `anchor`.
+
+        They do so where these moments are finite, also for other data and settings. The moments are arguments of all
+        programs.
+
+        Args:
+            z: (d,).
+            sites: names of likelihood sites; None: all that take iterations.
+        """
+        anchors = {name: model.anchor(z) for name, model in self.site_models.items()
+                   if (model.site.example.settings.iterations > 0 and model.site.example.is_iterated
+                       if sites is None else name in sites)}
+        finite = {name: anchor for name, anchor in anchors.items()
+                  if all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(anchor))}
+        if not finite:
+            return self
+        bound = self._copy(self.constants.with_anchors(finite), self.problem.with_anchors(finite), self._selected)
+        bound.anchor_point = np.asarray(z, float)
+        return bound
+
+    def with_all_sites(self) -> BoundModel:
+        """Return the same model with no likelihood site selected."""
+        return self if self._selected is None else self._copy(self.constants, self.problem, None)
+
+    def _anchored_as(self, bound: BoundModel) -> BoundModel:
+        """Return the same model whose iterations start from the moments of another one, at sites of the same names."""
+        anchors = bound.problem.anchors
+        if not anchors:
+            return self
+        anchored = self._copy(self.constants.with_anchors(anchors), self.problem.with_anchors(anchors), self._selected)
+        anchored.anchor_point = bound.anchor_point
+        return anchored
+
     def explicit_steps(self, z: Any, y: Any = None, requested_times: Any = None) -> ExplicitSteps:
         """Return what limits the explicit steps of the filter; series of a panel, or regimes, are a leading axis.
 
@@ -570,13 +631,15 @@ class BoundModel:
     def _modified(self, name: tuple[str, Hashable], modify: Callable[[Callable], Callable]) -> BoundModel:
         key = self._selected, *name
         if (modified := self._modifications.get(key)) is not None:
-            return modified if modified.model_data is self.model_data else modified._with_checked_data(self.model_data)
+            if modified.model_data is not self.model_data:
+                modified = modified._with_checked_data(self.model_data)
+            return modified._anchored_as(self)
         programs = Programs() if name[1] is None else self.programs.of_modified(key)
         modified = BoundModel.of(modify(self.model), *self.constants.call(), self.traced.caller, programs,
                                  self._selected)
         if name[1] is not None and modified.problem.data is not None and not checks.traced(self.problem):
             self._modifications[key] = modified
-        return modified
+        return modified._anchored_as(self)
 
     def program(self, name: Hashable, make: Callable[[], Any], problem: Problem | None = None) -> Any:
         """Return the function of this name, made at the first call for problems of this structure and these shapes.

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.grid_layout import GridLayout
+from lfm_ppl.filtering.iterated import Anchor
 from lfm_ppl.likelihoods.likelihood_site import SiteTimes
 from lfm_ppl.utils import checks
 
@@ -88,10 +89,13 @@ class Problem(eqx.Module):
         data: the data, a pytree of arrays; None where they are among the arguments, or where there are none.
         inputs: the positional arguments of the model with the place of the data, its keyword arguments, and the times
             of each likelihood by name of its site.
+        anchors: smoothed moments from which iterations of posterior linearisation start, by name of a site; other
+            sites start from the filter's.
     """
 
     data: Any
     inputs: Partition
+    anchors: dict[str, Anchor] = eqx.field(default_factory=dict)
 
     @classmethod
     def of_constants(cls, arguments: tuple, keywords: Mapping[str, Any], data: Any = None,
@@ -117,7 +121,11 @@ class Problem(eqx.Module):
 
     def with_data(self, data: Any) -> Problem:
         """Return the problem with other data, which must be an argument of its programs."""
-        return Problem(data, self.inputs)
+        return Problem(data, self.inputs, self.anchors)
+
+    def with_anchors(self, anchors: Mapping[str, Anchor]) -> Problem:
+        """Return the problem with other smoothed moments to start from, which are leaves."""
+        return Problem(self.data, self.inputs, dict(anchors))
 
     @property
     def kind(self) -> Hashable:

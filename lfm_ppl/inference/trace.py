@@ -38,6 +38,7 @@ from lfm_ppl.likelihoods.likelihood_site import (
     SiteTimes,
     likelihood_sites,
     record_likelihoods,
+    replace_anchors,
     replace_times,
 )
 from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
@@ -148,9 +149,10 @@ class TracedModel:
         return handlers.trace(substituted).get_trace(*arguments, **keywords)
 
     def with_times(self, problem: Problem) -> Callable:
-        """Return the seeded model whose likelihoods have the times of the problem."""
-        grids = problem.grids
-        return replace_times(self._seeded, grids) if grids else self._seeded
+        """Return the seeded model whose likelihoods have the times and the anchors of the problem."""
+        grids, anchors = problem.grids, problem.anchors
+        model = replace_times(self._seeded, grids) if grids else self._seeded
+        return replace_anchors(model, anchors) if anchors else model
 
     def draw(self, key: jax.Array, problem: Problem, strategy: Callable) -> jax.Array:
         """Return unconstrained values of the latent sites, (d,), by a NumPyro initialisation strategy."""

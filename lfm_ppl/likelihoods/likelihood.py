@@ -41,5 +41,9 @@ class Likelihood(dist.Distribution):
         """Return the same distribution with other settings of its filter, such as ``steps``."""
 
     @abstractmethod
+    def with_about(self, about: Any) -> Any:
+        """Return the same distribution with other smoothed moments from which its iterations start."""
+
+    @abstractmethod
     def checked(self, value: Any) -> jax.Array:
         """Return observations as an array after checking them."""

@@ -9,6 +9,7 @@ import jax
 from numpyro import handlers
 
 from lfm_ppl.filtering.grid_layout import GridLayout
+from lfm_ppl.filtering.iterated import Anchor
 from lfm_ppl.likelihoods.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.likelihoods.likelihood import Likelihood
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
@@ -113,6 +114,24 @@ class replace_times(LikelihoodHandler):  # noqa: N801 (an effect handler, named 
         if new.layout is not None and isinstance(likelihood, SeriesLikelihood):
             return likelihood.with_times(new.times, new.layout)
         return likelihood.with_times(new.times) if checks.traced(likelihood.times) else likelihood
+
+
+class replace_anchors(LikelihoodHandler):  # noqa: N801 (an effect handler, see above)
+    """Effect handler that gives likelihoods the smoothed moments from which their iterations start.
+
+    Args:
+        fn: a NumPyro model.
+        anchors: name of a site -> its moments; other sites stay as they are.
+    """
+
+    def __init__(self, fn: Callable[..., Any], anchors: Mapping[str, Anchor]) -> None:
+        self.anchors = anchors
+        super().__init__(fn)
+
+    def replacement(self, likelihood: Likelihood, site: dict[str, Any]) -> Any:
+        """Return the likelihood with these moments."""
+        anchor = self.anchors.get(site["name"])
+        return likelihood if anchor is None else likelihood.with_about(anchor)
 
 
 class remove_likelihood(LikelihoodHandler):  # noqa: N801 (an effect handler, see above)

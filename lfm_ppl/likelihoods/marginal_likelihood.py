@@ -22,7 +22,9 @@ from lfm_ppl.filtering.breakdown import warn_of_breakdown
 from lfm_ppl.filtering.ep.evidence import Evidence, evidence
 from lfm_ppl.filtering.ep.settings import FactorSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
-from lfm_ppl.filtering.iterated import number_of_iterations
+from lfm_ppl.filtering.forward import forward
+from lfm_ppl.filtering.iterated import Anchor, converged_anchor, number_of_iterations, posterior_linearisation
+from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.likelihoods.filter_settings import FilterSettings
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood, check_model, repeat_draw
 from lfm_ppl.linearisation.rule import Rule
@@ -77,6 +79,11 @@ class MarginalLikelihood(SeriesLikelihood):
         method: of integration, "runge-kutta" (explicit, the default), or "exponential" for stiff dynamics: its steps of
             order three are stable at any rate of decay, and each costs about ten explicit steps. It works
             with a ``tolerance``.
+        about: smoothed moments from which the iterations start, which leaves a fifth of the errors at the same cost:
+            ``bound.anchor(z)`` of a bound model or ``likelihood.anchor(y)`` at a point of high density, of the same
+            model and rule; at other times, or with other steps, they are interpolated. They are held fixed in the
+            gradient. With ``iterations=0`` the model is linearised about them. None: iterations start from the filter's
+            moments. They have no effect in a linear model, with an observation family or a ``tolerance``.
 
     Raises:
         ValueError, TypeError: as `lfm_ppl.filter`; also where it is used in a ``numpyro.plate``. In compiled code a
@@ -98,10 +105,13 @@ class MarginalLikelihood(SeriesLikelihood):
     Source: Hartikainen et al. (2012), section 4; Singer (2011), AStA 95.
     """
 
+    pytree_data_fields = ("about",)
+
     def __init__(self, model: LatentForceModel, times: ArrayLike, rule: Rule | None = None, steps: int | None = None,
                  max_step: float | None = None, iterations: int | None = None, damping: float | None = None,
                  tolerance: float | None = None, factors: FactorSettings | str | None = None, *,
-                 method: str | None = None, validate_args: bool | None = None, **unknown: Any):
+                 method: str | None = None, about: Anchor | None = None, validate_args: bool | None = None,
+                 **unknown: Any):
         for name in unknown:
             remedy = "; constraints are arguments of lfm.ConstrainedLikelihood" if name in CONSTRAINTS else ""
             raise TypeError(f"MarginalLikelihood has no argument {name!r}{remedy}.")
@@ -114,10 +124,42 @@ class MarginalLikelihood(SeriesLikelihood):
                              "this model is Gaussian, whose filter needs none. Leave out factors.")
         super().__init__(model, times, settings, given)
         self.settings = replace(settings, iterations=number_of_iterations(iterations, self.ssm, settings.tolerance))
+        self.about = about if self.is_iterated else None
 
     def with_settings(self, **settings: Any) -> MarginalLikelihood:
         """Return the same distribution with other settings of its filter, such as ``steps``."""
-        return MarginalLikelihood(self.model, self.times, **self.arguments | settings)
+        return MarginalLikelihood(self.model, self.times, **self.arguments | settings).with_about(self.about)
+
+    @property
+    def is_iterated(self) -> bool:
+        """Whether smoothed moments to linearise about have an effect: not for a family, a tolerance, a linear model."""
+        return not (self.is_family or self.settings.tolerance is not None or self.ssm.plan.is_linear)
+
+    def anchor(self, y: Any) -> Anchor:
+        """Return the converged smoothed moments given ``y`` (T, D), for ``about`` of the same likelihood.
+
+        There are as many iterations of posterior linearisation, 100 at most, as change a smoothed mean by 1e-9
+        standard deviations. They have no derivative in reverse mode.
+
+        Raises:
+            ValueError: an observation family or a tolerance, which take no such moments.
+        """
+        if self.is_family or self.settings.tolerance is not None:
+            raise ValueError("smoothed moments to start from are for a Gaussian observation and equal integration "
+                             "steps; leave out tolerance.")
+        about = None if self.about is None else self.about.on_grid(self.time_grid, True)
+        return converged_anchor(self.problem, GaussianUpdate(self.checked(y)), self.settings.damping, about)
+
+    def log_likelihood_after(self, y: jax.Array, iterations: jax.Array) -> jax.Array:
+        """Return the log likelihood of ``y`` (T, D) after a traced number of iterations from an anchor.
+
+        It has no derivative in reverse mode, and one program serves all numbers.
+        """
+        assert self.about is not None
+        problem, updater = self.problem, GaussianUpdate(y)
+        points = posterior_linearisation(problem, updater, iterations, self.settings.damping,
+                                         self.about.on_grid(self.time_grid, True)).points
+        return forward(problem, updater, about=points).log_likelihood.sum()
 
     @property
     def description(self) -> str:
@@ -136,10 +178,12 @@ class MarginalLikelihood(SeriesLikelihood):
                 f"in {settings.steps} steps between two times" if settings.tolerance is None
                 else f"with tolerance {settings.tolerance:g}")
         if not settings.iterations:
-            return "approximate (a single pass of the filter)"
+            single = "a single pass of the filter" if self.about is None else "linearised about smoothed moments"
+            return f"approximate ({single})"
+        start = "" if self.about is None else " from smoothed moments"
         count = {1: "one iteration", 2: "two iterations", 3: "three iterations"}.get(
             settings.iterations, f"{settings.iterations} iterations")
-        return f"approximate ({count} of posterior linearisation)"
+        return f"approximate ({count} of posterior linearisation{start})"
 
     @property
     def factor_settings(self) -> FactorSettings:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
 from lfm_ppl.filtering.ep.settings import FactorSettings
+from lfm_ppl.filtering.iterated import Anchor
 from lfm_ppl.filtering.stiffness import long_step_message, warn_of_message
 from lfm_ppl.likelihoods.constrained_likelihood import likelihood_with
 from lfm_ppl.likelihoods.likelihood import Likelihood
@@ -37,12 +38,13 @@ class Panel(Likelihood):
     """Many independent series as one distribution with a batch shape; made by `panel`."""
 
     support = constraints.real_matrix
-    pytree_data_fields = ("parameters", "times")
+    pytree_data_fields = ("parameters", "times", "about")
     pytree_aux_fields = ("build", "arguments")
     arguments: dict[str, Any] = {}
+    about: Anchor | None = None
 
     def __init__(self, build: Callable[..., LatentForceModel], parameters: Any, times: ArrayLike,
-                 arguments: dict[str, Any]):
+                 arguments: dict[str, Any], about: Anchor | None = None):
         leaves = jax.tree_util.tree_leaves(parameters)
         if not leaves:
             raise ValueError("parameters must hold at least one array with a leading axis for the series.")
@@ -52,7 +54,7 @@ class Panel(Likelihood):
             raise ValueError("every array in parameters needs the same leading axis, one entry a series; got "
                              f"{shapes}. Repeat a shared parameter with jnp.broadcast_to, or close over it in build.")
         refuse_times_by_site(times)
-        self.build, self.parameters, self.times = build, parameters, times
+        self.build, self.parameters, self.times, self.about = build, parameters, times, about
         self.arguments = {name: value for name, value in arguments.items() if value is not None}
         (count,) = sizes
         if self._has_series_times and np.shape(times)[0] != count:
@@ -87,8 +89,8 @@ class Panel(Likelihood):
     def _has_series_times(self) -> bool:
         return np.ndim(self.times) == 2
 
-    def _likelihood(self, parameters: Any, times: Any) -> SeriesLikelihood:
-        return likelihood_with(self.build(parameters), times, self.arguments)
+    def _likelihood(self, parameters: Any, times: Any, about: Anchor | None = None) -> SeriesLikelihood:
+        return likelihood_with(self.build(parameters), times, self.arguments).with_about(about)
 
     def _check_events(self, count: int) -> None:
         """Raise ValueError if an event of a series lies before its initial time."""
@@ -126,11 +128,18 @@ class Panel(Likelihood):
     def series(self, index: int) -> SeriesLikelihood:
         """Return the distribution of one series."""
         times = jnp.asarray(self.times, float)[index] if self._has_series_times else self.times
-        return self._likelihood(jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[index], self.parameters), times)
+        parameters, about = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf)[index], (self.parameters, self.about))
+        return self._likelihood(parameters, times, about)
 
     def with_settings(self, **settings: Any) -> Panel:
         """Return the same distribution with other settings of the filter of each series, such as ``steps``."""
-        return Panel(self.build, self.parameters, self.times, self.arguments | settings)
+        return Panel(self.build, self.parameters, self.times, self.arguments | settings, self.about)
+
+    def with_about(self, about: Anchor | None) -> Panel:
+        """Return the same distribution with other moments, by series, from which its iterations start."""
+        panel = copy.copy(self)
+        panel.about = about
+        return panel
 
     def with_times(self, times: ArrayLike) -> Panel:
         """Return the same distribution with concrete times instead of traced ones."""
@@ -142,8 +151,8 @@ class Panel(Likelihood):
         """Return ``function(distribution of a series, *its arguments)``, with the series as leading axis."""
         times = jnp.asarray(self.times, float) if self._has_series_times else None
         return mapped(
-            lambda p, t, *values: function(self._likelihood(p, self.times if t is None else t), *values),
-            jax.tree_util.tree_map(jnp.asarray, self.parameters), times, *arguments)
+            lambda p, t, about, *values: function(self._likelihood(p, self.times if t is None else t, about), *values),
+            jax.tree_util.tree_map(jnp.asarray, self.parameters), times, self.about, *arguments)
 
     def log_prob_per_observation(self, value: Any) -> jax.Array:
         """Return (B, T): the one-step-ahead log densities of each series."""
@@ -205,7 +214,7 @@ class Panel(Likelihood):
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayLike, rule: Rule | None = None,
           steps: int | None = None, max_step: float | None = None, iterations: int | None = None,
           damping: float | None = None, tolerance: float | None = None, factors: FactorSettings | str | None = None,
-          method: str | None = None) -> Panel:
+          method: str | None = None, about: Anchor | None = None) -> Panel:
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.
 
     The plate's name is the dimension of the series in the result of `lfm_ppl.fit`; `lfm_ppl.select_series` returns one
@@ -223,6 +232,8 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         tolerance: largest error of an integration step, in standard deviations; None for equal steps.
         factors: of an observation family.
         method: of integration.
+        about: smoothed moments of all series from which the iterations start, ``bound.anchor(z)``, with a leading
+            axis (B,).
 
     Returns:
         A distribution with batch shape (B,) and event shape (T, D).
@@ -242,4 +253,4 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
     """
     arguments = {"rule": rule, "steps": steps, "max_step": max_step, "iterations": iterations, "damping": damping,
                  "tolerance": tolerance, "factors": factors, "method": method}
-    return Panel(build, parameters, times, arguments)
+    return Panel(build, parameters, times, arguments, about)

@@ -32,7 +32,7 @@ from lfm_ppl.filtering.grid_layout import GridLayout
 from lfm_ppl.filtering.integrators.integrator import Integrator
 from lfm_ppl.filtering.integrators.methods import DEFAULT_METHOD, METHODS, choose_integrator
 from lfm_ppl.filtering.intervals import TimeGrid
-from lfm_ppl.filtering.iterated import posterior_linearisation
+from lfm_ppl.filtering.iterated import Anchor, posterior_linearisation
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals, filter_problem
 from lfm_ppl.filtering.smoother import SmootherResult, filtered_mean, smooth_on
 from lfm_ppl.filtering.stiffness import ExplicitSteps, explicit_steps, warn_of_long_steps
@@ -68,6 +68,8 @@ class SeriesLikelihood(Likelihood):
     accepted: ClassVar[tuple[str, ...]] = FilterSettings.names()
     """Names of the settings that the constructor takes."""
     layout: GridLayout | None = None
+    about: Anchor | None = None
+    """Smoothed moments from which the iterations of posterior linearisation start; None: the filter's."""
     regime_names: tuple[str, ...] = ()
 
     def __init__(self, model: LatentForceModel, times: Any, settings: FilterSettings, given: frozenset[str]) -> None:
@@ -212,6 +214,17 @@ class SeriesLikelihood(Likelihood):
         likelihood.times, likelihood.layout = times, layout
         return likelihood
 
+    @property
+    def is_iterated(self) -> bool:
+        """Whether smoothed moments to linearise about have an effect."""
+        return False
+
+    def with_about(self, about: Anchor | None) -> SeriesLikelihood:
+        """Return the same distribution with other moments from which its iterations start, if `is_iterated`."""
+        likelihood = copy.copy(self)
+        likelihood.about = about if self.is_iterated else None
+        return likelihood
+
     def expand(self, batch_shape: tuple[int, ...]) -> dist.Distribution:
         """Return independent series with the same parameters; in a ``numpyro.plate`` that is an error.
 
@@ -276,7 +289,7 @@ class SeriesLikelihood(Likelihood):
     def smooth(self, y: Any, at: Any = None, steps: int | None = None) -> SmootherResult:
         """Smooth with this distribution's settings, or with other ``steps``; see `lfm_ppl.smooth`.
 
-        Constraints are ignored.
+        Constraints are ignored. Moments to start from are interpolated at requested times.
 
         Args:
             y: (T, D), NaN where missing.
@@ -284,8 +297,9 @@ class SeriesLikelihood(Likelihood):
             steps: integration steps between two consecutive times; None: `steps` of the distribution.
         """
         grid, y = self.smoother_grid(at, steps), self.checked(y)
+        about = None if self.about is None else self.about.on_grid(grid, at is None and steps is None)
         result = smooth_on(self.ssm, self.settings.rule, grid, y, self.settings.iterations, self.settings.damping,
-                           self.factor_settings)
+                           self.factor_settings, about)
         if not self.is_family:
             warn_of_iterations(result.change, result.log_likelihood_change)
         warn_of_long_steps(self.ssm, self.settings.rule, grid, self.settings.steps if steps is None else steps,
@@ -350,13 +364,12 @@ class SeriesLikelihood(Likelihood):
 
         The terms of an observation family come from the assumed density filter.
         """
-        problem, updater, points, change = self.problem, GaussianUpdate(y), None, jnp.asarray(jnp.nan)
-        previous = change
+        problem, updater = self.problem, GaussianUpdate(y)
         if self.is_family:
             return assumed_density_filter(problem, y).log_likelihood, jnp.full(2, jnp.nan)
-        iterations = self.settings.iterations
-        if iterations:
-            points, change, previous = posterior_linearisation(problem, updater, iterations, self.settings.damping)
+        about = None if self.about is None else self.about.on_grid(self.time_grid, True)
+        points, change, previous = posterior_linearisation(problem, updater, self.settings.iterations,
+                                                           self.settings.damping, about)
         terms = at_intervals(forward(problem, updater, about=points).log_likelihood, self.time_grid.observed)
         return terms, jnp.stack([change, terms.sum() - previous])
 

@@ -145,6 +145,98 @@ def test_a_single_pass_is_the_default_of_a_linear_model_and_with_a_tolerance(mod
     np.testing.assert_allclose(result.log_likelihood, lfm.filter(model, TIMES, Y, **settings).log_likelihood, rtol=1e-9)
 
 
+@pytest.mark.parametrize("model", [
+    double_well(), pytest.param(motif(softplus, genes=1), marks=pytest.mark.slow),
+    pytest.param(curved_observation(), marks=pytest.mark.slow),
+], ids=["state", "force", "observation"])
+def test_moments_at_the_same_parameters_are_a_fixed_point(model):
+    def likelihood(**settings):
+        return lfm.MarginalLikelihood(model, TIMES, steps=2, **settings)
+
+    @jax.jit
+    def run(y):
+        about = likelihood().anchor(y)
+        result = lfm.smooth(model, TIMES, y, steps=2, iterations=2, about=about)
+        return (likelihood(iterations=60).log_prob(y), result.log_likelihood.sum(), result.change,
+                *(likelihood(iterations=count, about=about).log_prob(y) for count in (0, 1, 2)))
+
+    converged, smoother, change, *values = run(Y)
+    np.testing.assert_allclose([smoother, *values], converged, rtol=1e-9)
+    assert change < 1e-7
+
+
+@pytest.mark.parametrize(("well", "y"), [BREAKING[0], pytest.param(*BREAKING[1], marks=pytest.mark.slow)])
+def test_moments_to_start_from_have_limited_variances(well, y):
+    """At their own parameters, and at others, where the limit follows the variances that a pass predicts."""
+    times, y = well.spacing * np.arange(1, len(y) + 1), jnp.array(y)[:, None]
+
+    @jax.jit
+    def run(well, about):
+        return lfm.smooth(model_of(well), times, y, about=about).log_likelihood.sum()
+
+    about = jax.jit(lambda y: lfm.MarginalLikelihood(model_of(well), times).anchor(y))(y)
+    assert float(about.variance_share.min()) < 0.5
+    other = well._replace(dispersion=1.2 * well.dispersion)
+    converged = lfm.smooth(model_of(well), times, y, iterations=60).log_likelihood.sum()
+    assert abs(run(well, about) - converged) < 0.1, "these iterations never settle entirely"
+    assert abs(run(other, about) - exact_log_likelihood(other, np.array(y)[:, 0])) < 1.2
+
+
+def test_gradients_hold_the_moments_to_start_from_fixed():
+    well = Well(2.0, 0.7, 0.05, 0.5, 0.9, 0.2)
+    times, y = well.spacing * np.arange(1, 7), jnp.array([0.8, 1.1, 0.7, 0.2, -0.4, -0.9])[:, None]
+
+    def log_likelihood(logarithms, about):
+        strength, dispersion = jnp.exp(logarithms)
+        model = model_of(well._replace(strength=strength, dispersion=dispersion))
+        return lfm.MarginalLikelihood(model, times, steps=3, iterations=1, about=about).log_prob(y)
+
+    point = jnp.log(jnp.array([2.6, 0.6]))
+    about = jax.jit(lambda y: lfm.MarginalLikelihood(model_of(well), times, steps=3).anchor(y))(y)
+    value = jax.jit(log_likelihood)
+    gradients = jax.jit(jax.grad(log_likelihood))(point, about), jax.jit(jax.jacfwd(log_likelihood))(point, about)
+    for index, step in enumerate(1e-5 * jnp.eye(2)):
+        difference = (value(point + step, about) - value(point - step, about)) / 2e-5
+        np.testing.assert_allclose([gradient[index] for gradient in gradients], difference, rtol=1e-6)
+
+
+def test_moments_to_start_from_are_interpolated_on_another_grid():
+    model, at = motif(softplus, genes=1), np.array([0.4, 0.6, 1.9, 2.2, 3.0])
+
+    @jax.jit
+    def run(y):
+        about = lfm.MarginalLikelihood(model, TIMES, steps=4).anchor(y)
+        finer = lfm.MarginalLikelihood(model, TIMES, steps=8).anchor(y)
+        result = lfm.smooth(model, TIMES, y, steps=4, iterations=2, at=at, about=about)
+        converged = lfm.smooth(model, TIMES, y, steps=4, iterations=60, at=at)
+        interpolated = about.on_grid(lfm.MarginalLikelihood(model, TIMES, steps=8).time_grid)
+        values = [lfm.MarginalLikelihood(model, TIMES, steps=8, iterations=2, about=start).log_prob(y)
+                  for start in (about, finer)]
+        errors = jnp.stack([jnp.abs(result.mean - converged.mean).max(), jnp.abs(values[0] - values[1])])
+        return interpolated, finer, errors
+
+    interpolated, finer, errors = run(Y)
+    for a, b in zip(jax.tree.leaves(interpolated), jax.tree.leaves(finer), strict=True):
+        np.testing.assert_allclose(a, b, atol=0.05)
+    assert errors.max() < 0.01
+
+
+def test_moments_to_start_from_change_no_linear_model_and_belong_to_a_rule():
+    linear = lfm.MarginalLikelihood(motif(identity, genes=1), TIMES)
+
+    @jax.jit
+    def run(y):
+        about = linear.anchor(y)
+        return about, linear.log_prob(y), lfm.MarginalLikelihood(linear.model, TIMES, about=about).log_prob(y)
+
+    about, *values = run(Y)
+    assert np.isclose(*values, rtol=1e-12)
+    with pytest.raises(ValueError, match=r"about .* 0 states.* 1"):
+        jax.jit(lfm.MarginalLikelihood(double_well(), TIMES, about=about).log_prob)(Y)
+    with pytest.raises(ValueError, match="tolerance"):
+        lfm.MarginalLikelihood(double_well(), TIMES, tolerance=1e-3).anchor(Y)
+
+
 def test_iterations_that_go_wrong_warn_outside_of_compiled_code():
     well, y = BREAKING[0]
     model, times, y = model_of(well), well.spacing * np.arange(1, len(BREAKING[0][1]) + 1), np.array(y)[:, None]

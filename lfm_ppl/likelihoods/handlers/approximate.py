@@ -67,7 +67,8 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         ended = ["tolerance"] * has_equal_steps + ["iterations"] * is_single_pass
         settings = {name: None for name in ended if name in likelihood.arguments} | self.settings
         if isinstance(likelihood, MarginalLikelihood):  # bounds make it another class
-            return likelihood_with(likelihood.model, likelihood.times, likelihood.arguments | settings)
+            new = likelihood_with(likelihood.model, likelihood.times, likelihood.arguments | settings)
+            return new.with_about(likelihood.about)
         return likelihood.with_settings(**settings)
 
 
