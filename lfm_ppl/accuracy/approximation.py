@@ -64,7 +64,8 @@ def more_iterations(example: SeriesLikelihood) -> Refinement | None:
     if example.has_factors or example.ssm.plan.is_linear or not example.has_gaussian_state:
         return None
     current = example.settings.iterations
-    count = DEFAULT_ITERATIONS if current < DEFAULT_ITERATIONS else max(_MANY_ITERATIONS, 2 * current)
+    is_short = current < DEFAULT_ITERATIONS and example.about is None
+    count = DEFAULT_ITERATIONS if is_short else max(_MANY_ITERATIONS, 2 * current)
     return Refinement({"iterations": count}, f"{count} iterations of posterior linearisation instead of {current}",
                       f"iterations={count} (--iterations {count})")
 

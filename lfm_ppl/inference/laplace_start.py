@@ -78,12 +78,12 @@ def laplace_approximation(key: jax.Array, bound: BoundModel) -> Laplace:
         raise UnusableModeError("the Hessian at the posterior mode is not finite")
     if not result.converged:
         raise UnusableModeError(f"the search of the posterior mode did not converge: {result.message.rstrip('.')}")
-    if _has_second_mode(result):
+    if has_second_mode(result):
         raise UnusableModeError("the posterior has several modes of similar height")
     return Laplace(result.mode, result.start_covariance)
 
 
-def _has_second_mode(result: MAPResult) -> bool:
+def has_second_mode(result: MAPResult) -> bool:
     """Return whether another start ended far from the mode at a similar log density."""
     factor = np.linalg.cholesky(result.covariance)
     for end, log_density in zip(result.restart_ends, result.restart_log_densities, strict=True):

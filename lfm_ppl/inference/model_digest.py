@@ -29,6 +29,8 @@ _TIMES = 16
 def model_digest(bound: BoundModel) -> str:
     """Return a digest of the values of prior, dynamics and observation, and of the settings of the likelihood.
 
+    The point at whose moments its iterations start is one of these settings.
+
     They are evaluated at the prior's medians and at one other point, at 16 times and one state, without the filter.
     """
     times = np.unique(np.concatenate([np.ravel(part) for part in jax.tree.leaves(bound.times)]))
@@ -40,6 +42,8 @@ def model_digest(bound: BoundModel) -> str:
             is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
             array = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
             digest.update(f"{array.shape}{array.dtype}".encode() + _rounded(array))
+    if bound.anchor_point is not None:  # the moments are a function of it
+        digest.update(np.asarray(bound.anchor_point, float).tobytes())
     digest.update(re.sub(r"0x[0-9a-f]+", "", recorder.settings).encode())  # addresses differ between processes
     return digest.hexdigest()
 

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from lfm_ppl.accuracy.log_likelihoods import LikelihoodProblem
+from lfm_ppl.accuracy.tuning import anchored
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.io.data_set import (
@@ -209,7 +210,7 @@ def problem(result: Any, numpyro_model: Callable, times: Any = None, y: Any = No
         raise TypeError(f"the model needs {', '.join(missing)}: pass model_kwargs={{{example}}}.") from error
     for name, site_model in bound.site_models.items():
         _check_settings(site_model.site, settings.get(name, {}) if settings else view.attrs)
-    bound = bound.fix(view.decoded("fixed"))
+    bound = anchored(bound.fix(view.decoded("fixed")), view.attrs)
     if not bound.sites:
         raise ValueError("the model has no parameters that are sampled, so there is nothing to check.")
     return LikelihoodProblem(bound, parameter_draws(bound, posterior))

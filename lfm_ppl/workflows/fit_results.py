@@ -16,7 +16,7 @@ import json
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -45,7 +45,7 @@ from lfm_ppl.storage.run_record import check_same
 from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.progress import Console
 from lfm_ppl.utils.random_keys import split_by_name
-from lfm_ppl.workflows.fit_options import FitOptions, versions
+from lfm_ppl.workflows.fit_options import FitOptions, likelihood_settings, versions
 
 ONLY_DRAWS = "all draws, without scores and trajectories"
 """Attribute ``partial`` of a result without any post-processing."""
@@ -104,6 +104,13 @@ class FitProblem:
     description: dict[str, Any]
     user_attributes: dict[str, Any]
     start_time: float
+
+    def with_bound(self, bound: BoundModel) -> FitProblem:
+        """Return the same problem with other settings of its likelihoods, such as iterations that start at the mode."""
+        sites = {name: replace(self.sites[name], bound=model, description={
+            **self.sites[name].description, **likelihood_settings(model.site.example),
+        }) for name, model in bound.site_models.items()}
+        return replace(self, bound=bound, sites=sites, description=self.description | self.options.description(bound))
 
 
 @dataclass(frozen=True)

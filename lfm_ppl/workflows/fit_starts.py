@@ -5,7 +5,9 @@
 2. A random walk needs no gradient, but to learn the shape of the posterior by rejection takes thousands of steps. Its
    first proposal covariance is that of the Laplace approximation, and its chains start at draws from it.
 3. Particle-marginal RAM also chooses the number of particles, by default at the mode.
-4. A resumed run finds nothing anew: its setup holds the numbers that were chosen before the first step.
+4. With a usable mode, the likelihood's iterations start from the smoothed moments there, and are as few as suffice
+   (`lfm_ppl.accuracy.tuning`).
+5. A resumed run finds nothing anew: its setup holds the numbers that were chosen before the first step.
 
 Source: `lfm_ppl.inference.laplace_start`; Vihola (2012), Statistics and Computing 22, 997-1008.
 """
@@ -22,12 +24,19 @@ import jax
 import numpy as np
 from numpyro.infer import init_to_median, init_to_value
 
+from lfm_ppl.accuracy.tuning import ANCHOR, Tuning, anchor_at_mode, anchor_attribute, anchored
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.bound_samplers import BoundSampler, nuts_sampler, particle_marginal_sampler, ram_sampler
 from lfm_ppl.inference.kernels.options import KERNELS
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
 from lfm_ppl.inference.kernels.ram import RAM
-from lfm_ppl.inference.laplace_start import Laplace, UnusableModeError, laplace_approximation, starting_points
+from lfm_ppl.inference.laplace_start import (
+    Laplace,
+    UnusableModeError,
+    has_second_mode,
+    laplace_approximation,
+    starting_points,
+)
 from lfm_ppl.inference.map import MAPResult, mode_of
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.random_keys import split_keys
@@ -39,7 +48,7 @@ FALLBACK = "init_fallback"
 _WARMUP, _SHORT_WARMUP = 1000, 300
 """Default warm-up draws of each chain; the short one is that of NUTS from the Laplace approximation."""
 
-_SETUP = ("particles", "log_likelihood_sd", "warmup", "init", FALLBACK)
+_SETUP = ("particles", "log_likelihood_sd", "warmup", "init", FALLBACK, ANCHOR)
 """Attributes that a resumed run needs."""
 
 
@@ -53,6 +62,7 @@ class ChainStart:
         attributes: of the result, with ``warmup``, the number of warm-up draws.
         particle_options: keyword arguments of the particle smoother; empty for other samplers.
         mode: (d,), the posterior mode where it is known.
+        tunings: settings of the likelihoods that were found at the mode, by site.
     """
 
     sampler: BoundSampler
@@ -60,6 +70,7 @@ class ChainStart:
     attributes: dict[str, Any]
     particle_options: dict[str, Any] = field(default_factory=dict)
     mode: np.ndarray | None = None
+    tunings: Mapping[str, Tuning] = field(default_factory=dict)
 
     @property
     def setup(self) -> dict[str, Any]:
@@ -88,14 +99,14 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
     # The Laplace approximation does not regularise a mass matrix of the user.
     is_regularized = "inverse_mass_matrix" not in sampler_options and sampler_options.get("dense_mass", True) is True
 
-    def sampler(laplace: Laplace | None, warmup: int) -> BoundSampler:
+    def sampler(bound: BoundModel, laplace: Laplace | None, warmup: int) -> BoundSampler:
         num_warmup = warmup * (options.thin or 1)
         return nuts_sampler(bound, num_warmup, sampler_options, laplace if is_regularized else None)
 
     if setup is not None:
         # The stored state holds the approximation; the program needs its shapes only.
         shapes = Laplace(np.zeros(bound.size), np.eye(bound.size)) if setup["init"] == "laplace" else None
-        return ChainStart(sampler(shapes, setup["warmup"]), None, dict(setup))
+        return ChainStart(sampler(anchored(bound, setup), shapes, setup["warmup"]), None, dict(setup))
     laplace, fallback = None, {}
     is_at_mode = options.init in (None, "map")
     if is_at_mode:
@@ -105,12 +116,16 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
             fallback = {FALLBACK: f"the chains start at the prior median, with a unit mass matrix: {error}"}
     default_warmup = _SHORT_WARMUP if laplace is not None and is_regularized else _WARMUP
     warmup = default_warmup if options.warmup is None else options.warmup
-    nuts = sampler(laplace, warmup)
+    tunings: dict[str, Tuning] = {}
+    if laplace is not None:
+        bound, tunings = anchor_at_mode(options.keys["tuning"], bound, laplace)
+    nuts = sampler(bound, laplace, warmup)
     if is_at_mode:  # the advice for a slow warm-up is to start there
         nuts = dataclasses.replace(nuts, slow_warmup_hint="")
     if laplace is not None:
         points = starting_points(options.keys["starts"], bound, laplace, options.chains)
-        return ChainStart(nuts, points, {"warmup": warmup, "init": "laplace"}, mode=laplace.mode)
+        attributes = {"warmup": warmup, "init": "laplace", **anchor_attribute(bound, tunings)}
+        return ChainStart(nuts, points, attributes, mode=laplace.mode, tunings=tunings)
     strategy = init_to_median if is_at_mode else _strategy(options)
     points = _starting_points(bound, options, strategy, nuts.evaluate)
     init = "strategy" if callable(options.init) else "median"
@@ -120,11 +135,13 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
 def _find_random_walk_start(bound: BoundModel, options: FitOptions, setup: Mapping[str, Any] | None) -> ChainStart:
     kernel_type, sampler_options = KERNELS[options.sampler], dict(options.sampler_options)
     if setup is not None:
-        kernel = kernel_type(bound.model, **sampler_options)
+        bound, kernel = anchored(bound, setup), kernel_type(bound.model, **sampler_options)
         if isinstance(kernel, ParticleMarginalRAM):
             kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
-        return _random_walk_start(bound, options, kernel, None)
+        start = _random_walk_start(bound, options, kernel, None)
+        return dataclasses.replace(start, attributes={**start.attributes, **setup})
     has_covariance = "initial_covariance" in sampler_options
+    tunings: dict[str, Tuning] = {}
     mode = None if has_covariance and options.init != "map" else _find_mode(bound, options)
     strategy = _strategy(options, mode)
     # Without a usable covariance the mode is a starting point only.
@@ -135,6 +152,8 @@ def _find_random_walk_start(bound: BoundModel, options: FitOptions, setup: Mappi
         if options.sampler == "pmmh":
             # The start of a chain may be far from the posterior, where the variance of the estimate is another one.
             sampler_options.setdefault("tune_at", bound.unravel(mode.mode))
+        elif options.init is None and mode.converged and not has_second_mode(mode):
+            bound, tunings = anchor_at_mode(options.keys["tuning"], bound, Laplace(mode.mode, mode.start_covariance))
     kernel = kernel_type(bound.model, **sampler_options)
     if mode is None or options.init is not None:
         points = _starting_points(bound, options, strategy, bound.log_density)
@@ -143,7 +162,8 @@ def _find_random_walk_start(bound: BoundModel, options: FitOptions, setup: Mappi
     if isinstance(kernel, ParticleMarginalRAM):
         kernel.prepare(bound, points[0])
     start = _random_walk_start(bound, options, kernel, points)
-    return start if mode is None else dataclasses.replace(start, mode=mode.mode)
+    attributes = {**start.attributes, **anchor_attribute(bound, tunings)}
+    return dataclasses.replace(start, attributes=attributes, mode=None if mode is None else mode.mode, tunings=tunings)
 
 
 def _random_walk_start(bound: BoundModel, options: FitOptions, kernel: RAM, points: np.ndarray | None) -> ChainStart:
@@ -185,5 +205,5 @@ def _draws_about_mode(bound: BoundModel, options: FitOptions, mode: MAPResult) -
     root = np.linalg.cholesky(mode.covariance)
     normals = np.asarray(jax.random.normal(options.keys["starts"], (options.chains, bound.size)))
     points = mode.mode + normals @ root.T
-    is_possible = [bool(np.isfinite(bound.log_density_gradient(point)[0])) for point in points]
+    is_possible = [bool(np.isfinite(bound.log_density(point))) for point in points]
     return np.where(np.array(is_possible)[:, None], points, mode.mode)

@@ -20,6 +20,7 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
+from lfm_ppl.accuracy.tuning import ANCHOR
 from lfm_ppl.cli import main
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.samplers import SAMPLERS
@@ -42,6 +43,15 @@ def relaxation(times, y=None, width=0.3):
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, width))
     system = lfm.LatentForceModel(
         lambda x, u, t: -x, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        lfm.Gaussian(jnp.array([0.5]), jnp.array([[0.2]])), process_noise=noise * jnp.eye(1))
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1), obs=y)
+
+
+def bent(times, y=None):
+    """Not linear, so that the iterations of its likelihood start at the mode."""
+    noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: -(x**3), {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
         lfm.Gaussian(jnp.array([0.5]), jnp.array([[0.2]])), process_noise=noise * jnp.eye(1))
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1), obs=y)
 
@@ -98,14 +108,18 @@ def whole():
     return functools.cache(fit)
 
 
-@pytest.mark.parametrize("sampler", ["nuts", "ram", pytest.param("pmmh", marks=pytest.mark.slow)])
-def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_path, stop_after):
-    expected = whole(sampler)
+@pytest.mark.parametrize(("sampler", "model"), [
+    ("nuts", relaxation), ("ram", relaxation), pytest.param("nuts", bent, marks=pytest.mark.slow),
+    pytest.param("ram", bent, marks=pytest.mark.slow),
+    pytest.param("pmmh", relaxation, marks=pytest.mark.slow)])
+def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, model, whole, tmp_path, stop_after):
+    expected = whole(sampler, model=model)
+    assert (ANCHOR in ResultView.of(expected).attrs) == (model is bent)
     stop_after(0, steps=3)
     with pytest.raises(KeyboardInterrupt, match="warm-up"):
-        fit(sampler, checkpoint=tmp_path / "run")
+        fit(sampler, model=model, checkpoint=tmp_path / "run")
     stop_after(3)
-    partial = fit(sampler, checkpoint=tmp_path / "run", resume=True)
+    partial = fit(sampler, model=model, checkpoint=tmp_path / "run", resume=True)
     said = ResultView.of(partial).attrs["partial"]
     count = ResultView.of(partial).posterior.sizes["draw"]
     assert 3 <= count < 6 and said.startswith(f"{count} of 6 draws")
@@ -114,7 +128,7 @@ def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_pat
                                     ResultView.of(expected).group(name).isel(draw=slice(count)))
     assert_same(lfm.load(tmp_path / "run"), partial)
     assert arviz_data.summary(partial)["partial"].str.startswith(f"{count} of 6 draws").all()
-    assert_same(fit(sampler, checkpoint=tmp_path / "run", resume=True), expected)
+    assert_same(fit(sampler, model=model, checkpoint=tmp_path / "run", resume=True), expected)
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["posterior.nc"]
     assert "partial" not in arviz_data.summary(expected)
 

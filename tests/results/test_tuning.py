@@ -1,0 +1,117 @@
+"""Fits whose iterations start at the posterior mode: as few as suffice, and one density wherever it is evaluated."""
+
+import json
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from systems import double_well
+
+import lfm_ppl as lfm
+from lfm_ppl.accuracy.log_likelihoods import gaussian
+from lfm_ppl.accuracy.tuning import ANCHOR, TOLERATED_ERROR, anchor_at_mode
+from lfm_ppl.inference.laplace_start import laplace_approximation
+from lfm_ppl.results import rebuilding
+from lfm_ppl.results.result_view import ResultView
+
+TIMES = 0.5 * np.arange(1, 9)
+Y = np.array([0.9, 1.1, 0.7, 0.5, 0.1, -0.6, -0.8, -1.1])[:, None]
+
+
+def crossing(times, y=None):
+    strength = numpyro.sample("strength", dist.LogNormal(0.0, 0.3))
+    dispersion = numpyro.sample("dispersion", dist.LogNormal(-0.3, 0.3))
+    system = double_well(0.9, 0.1, dispersion, 0.03, -strength, strength)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=2), obs=y)
+
+
+def fit(model=crossing, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return lfm.fit(model, TIMES, Y, **{"chains": 2, "warmup": 30, "samples": 30, "trajectory_draws": 4,
+                                           "progress": False} | options)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return fit(at=[0.7, 4.0, 5.0])
+
+
+def test_a_result_names_its_density_and_gives_it_again(result):
+    attrs = ResultView.of(result).attrs
+    tuning = json.loads(attrs[ANCHOR])["sites"]["y"]
+    assert attrs["iterations"] == tuning["iterations"] in (0, 1, 2, 3, 6)
+    assert tuning["error"] <= TOLERATED_ERROR or tuning["iterations"] == 6
+    assert "smoothed moments" in attrs["likelihood"]
+    problem = rebuilding.problem(result, crossing)
+    recorded = result["one_step_ahead"]["log_density"].transpose("chain", "draw", ...).values.sum(axis=-1).ravel()
+    np.testing.assert_allclose(gaussian(problem), recorded, rtol=1e-9)
+    converged = gaussian(problem, iterations=40)
+    from_filter = gaussian(rebuilding.LikelihoodProblem(lfm.bind(crossing, TIMES, Y), problem.draws))
+    assert np.std(recorded - converged) < max(2 * TOLERATED_ERROR, 0.3 * np.std(from_filter - converged))
+    mean = lfm.forecast(result, crossing, [4.5], draws=8, progress=False)  # compares log likelihoods
+    assert "predictions" in ResultView.of(mean).groups
+
+
+def test_the_sampler_saw_the_density_that_the_result_names(result):
+    bound = rebuilding.problem(result, crossing).bound
+    draws = {name: result["posterior"][name].values for name in bound.sites}
+    for chain, draw in ((0, 3), (1, 29)):
+        z = bound.unconstrain({name: values[chain, draw] for name, values in draws.items()})
+        assert np.isclose(bound.log_density(z), result["sample_stats"]["lp"].values[chain, draw], rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("options", "iterations"), [
+    ({"init": "median"}, 3), ({"sampler": "map", "samples": 20}, 3), ({"iterations": 0}, 0)])
+def test_without_a_mode_or_iterations_nothing_is_tuned(options, iterations):
+    attrs = ResultView.of(fit(**options)).attrs
+    assert ANCHOR not in attrs and attrs["iterations"] == iterations
+
+
+@pytest.mark.slow
+def test_a_number_that_the_model_names_stays_and_starts_at_the_mode():
+    result = fit(sampler="ram", iterations=2, samples=10, warmup=20, trajectory_draws=0)
+    attrs = ResultView.of(result).attrs
+    assert attrs["iterations"] == 2 and json.loads(attrs[ANCHOR])["sites"] == {"y": {}}
+    recorded = result["one_step_ahead"]["log_density"].transpose("chain", "draw", ...).values.sum(axis=-1).ravel()
+    np.testing.assert_allclose(gaussian(rebuilding.problem(result, crossing)), recorded, rtol=1e-9)
+
+
+def panel(times, y=None):
+    with numpyro.plate("series", 2):
+        dispersion = numpyro.sample("dispersion", dist.LogNormal(-0.3, 0.3))
+        numpyro.sample("y", lfm.panel(lambda p: double_well(0.9, 0.1, p, 0.03), dispersion, times, steps=2), obs=y)
+
+
+def two_sites(times, y=None):
+    dispersion = numpyro.sample("dispersion", dist.LogNormal(-0.3, 0.3))
+    for name in ("a", "b"):
+        numpyro.sample(name, lfm.MarginalLikelihood(double_well(0.9, 0.1, dispersion, 0.03), times[name], steps=2),
+                       obs=y[name])
+
+
+@pytest.mark.parametrize(("model", "times", "y"), [
+    (panel, TIMES, np.stack([Y, np.abs(Y)])),
+    pytest.param(two_sites, {"a": TIMES, "b": TIMES[:5]}, {"a": Y, "b": Y[:5]}, marks=pytest.mark.slow),
+], ids=["panel", "sites"])
+def test_series_and_sites_have_moments_of_their_own(model, times, y):
+    bound = lfm.bind(model, times, y)
+    z = jnp.full(bound.size, -0.4)
+    anchored = bound.anchored(z)
+    converged = bound
+    for name in bound.site_models:
+        converged = converged.site_models[name].approximate(iterations=60).with_all_sites()
+    assert np.isclose(anchored.log_density(z), converged.log_density(z), rtol=1e-7)
+    other = z + 0.3
+    errors = [abs(start.log_density(other) - converged.log_density(other)) for start in (anchored, bound)]
+    assert errors[0] < errors[1]
+    laplace = laplace_approximation(jax.random.key(0), bound)
+    tuned, tunings = anchor_at_mode(jax.random.key(1), bound, laplace)
+    assert set(tunings) == set(bound.site_models)
+    assert {name: model.site.example.settings.iterations for name, model in tuned.site_models.items()} == {
+        name: tuning.iterations for name, tuning in tunings.items()}
