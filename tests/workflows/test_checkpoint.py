@@ -20,6 +20,7 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
+from lfm_ppl.inference.tuning import ANCHOR
 from lfm_ppl.cli import main
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.samplers import SAMPLERS
