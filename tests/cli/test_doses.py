@@ -96,6 +96,7 @@ PANEL = MODEL.replace("""    ke = numpyro.sample("ke", dist.LogNormal(-1.0, 0.5)
 """)
 
 
+@pytest.mark.thorough
 def test_subjects_of_a_file_are_fitted_together_with_their_doses(files, run):
     (files / "panel.py").write_text(PANEL)
     rows = [f"{subject},{row}" for subject, shift in (("Ann", 0), ("Bo", 2)) for row in ROWS.splitlines()[1 + shift:]]

@@ -112,7 +112,8 @@ def close(result, expected, tolerance=1e-9):
     assert np.abs(result - expected).max() <= tolerance * np.abs(expected).max()
 
 
-@pytest.fixture(scope="module", params=["previous", "linear", "noise"])
+@pytest.fixture(scope="module", params=["previous", *(
+    pytest.param(kind, marks=pytest.mark.thorough) for kind in ("linear", "noise"))])
 def case(request):
     """The compiled results of a kind of model as a function of its parameters, and its dense algebra."""
     settings = {"way": "previous", "varying_noise": True} if request.param == "noise" else {"way": request.param}

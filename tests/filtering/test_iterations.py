@@ -144,6 +144,7 @@ def test_a_single_pass_is_the_default_of_a_linear_model_and_with_a_tolerance(mod
     np.testing.assert_allclose(result.log_likelihood, lfm.filter(model, TIMES, Y, **settings).log_likelihood, rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_iterations_that_go_wrong_warn_outside_of_compiled_code():
     well, y = BREAKING[0]
     model, times, y = model_of(well), well.spacing * np.arange(1, len(BREAKING[0][1]) + 1), np.array(y)[:, None]
@@ -181,6 +182,7 @@ def test_limited_variances_keep_correlations_and_have_finite_derivatives():
     np.testing.assert_array_equal(limit_variance(moments, jnp.array([9.0, 9.0, 0.0])).covariance, covariance)
 
 
+@pytest.mark.thorough
 def test_the_default_is_near_the_exact_likelihood_of_double_wells():
     wells, y, exact = random_wells(WELLS)
     result = jax.jit(jax.vmap(smooth_well))(wells, jnp.asarray(y))

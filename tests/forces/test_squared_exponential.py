@@ -166,6 +166,7 @@ def log_likelihood_error(order, times, ell, sd):
     return 0.5 * np.sum(values - 1.0 - np.log(values)) + 2.5 * np.sqrt(0.5 * np.sum((values - 1.0) ** 2))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("order", "sd", "error"), [
     (DEFAULT, 0.01, 0.0215), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
         (2, 1.0, 1.6), (2, 0.1, 18.5), (2, 0.01, 105.0), (4, 1.0, 0.076), (4, 0.1, 0.9), (4, 0.01, 24.5),

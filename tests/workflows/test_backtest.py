@@ -106,6 +106,7 @@ def test_wrong_arguments_are_named(change, name):
         lfm.backtest(motif.model, **{"times": TIMES, "y": data(), "horizon": 1, **change})
 
 
+@pytest.mark.thorough
 def test_an_error_of_a_fit_keeps_its_type_and_names_the_origin(monkeypatch):
     def fail(*arguments, **keywords):
         raise UnicodeDecodeError("ascii", b"\xff", 0, 1, "not a text")  # a type that takes five arguments

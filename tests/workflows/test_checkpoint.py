@@ -98,7 +98,8 @@ def whole():
     return functools.cache(fit)
 
 
-@pytest.mark.parametrize("sampler", ["nuts", "ram", pytest.param("pmmh", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("sampler", [
+    pytest.param("nuts", marks=pytest.mark.thorough), "ram", pytest.param("pmmh", marks=pytest.mark.slow)])
 def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_path, stop_after):
     expected = whole(sampler)
     stop_after(0, steps=3)
@@ -119,6 +120,7 @@ def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, whole, tmp_pat
     assert "partial" not in arviz_data.summary(expected)
 
 
+@pytest.mark.thorough
 def test_a_stop_after_sampling_costs_no_draw(whole, tmp_path, monkeypatch):
     sampler = "ram"
 
@@ -140,6 +142,7 @@ def test_a_stop_after_sampling_costs_no_draw(whole, tmp_path, monkeypatch):
     assert_same(fit(sampler, checkpoint=tmp_path, resume=True), whole(sampler))
 
 
+@pytest.mark.thorough
 def test_a_run_that_nothing_keeps_gives_what_it_has(whole, monkeypatch):
     monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
     adapt = sampling._BlockLength.adapt
@@ -198,6 +201,7 @@ def test_another_run_is_not_resumed(unfinished, changes, name):
     assert {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.thorough
 def test_a_run_of_other_versions_or_in_use_is_not_resumed(unfinished, monkeypatch):
     first = Checkpoint.resume(unfinished, json.loads((unfinished / "checkpoint" / "run.json").read_text()))
     with pytest.raises(RuntimeError, match="in use"):
@@ -233,6 +237,7 @@ def test_folders_that_cannot_be_used(unfinished, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
+@pytest.mark.thorough
 def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
     def stop(*arguments, **keywords):
         raise KeyboardInterrupt
@@ -246,6 +251,7 @@ def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
 # Accuracy
 
 
+@pytest.mark.thorough
 def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
     result = whole("map")
     monkeypatch.setattr("lfm_ppl.inference.draw_batches._SEQUENTIAL_BATCH", 2)
@@ -276,6 +282,7 @@ def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
 # Progress
 
 
+@pytest.mark.thorough
 def test_where_there_is_no_terminal_lines_say_how_far_it_is(capfd, monkeypatch):
     monkeypatch.setattr("lfm_ppl.utils.progress.EVERY_S", 0.0)
     with warnings.catch_warnings():
