@@ -213,6 +213,7 @@ def test_a_run_of_other_versions_or_in_use_is_not_resumed(unfinished, monkeypatc
         fit("ram", checkpoint=unfinished, resume=True)
 
 
+@pytest.mark.thorough
 def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
     expected = whole("ram")
     fit("ram", checkpoint=tmp_path)
@@ -382,6 +383,7 @@ def test_ctrl_c_leaves_a_usable_result_within_ten_seconds(tmp_path):
         assert f"{count} of 1000000 draws" in said
 
 
+@pytest.mark.thorough
 def test_a_finished_run_is_left_alone_by_the_command(tmp_path, monkeypatch):
     (tmp_path / "relaxation.py").write_text(MODEL)
     monkeypatch.chdir(tmp_path)

@@ -157,6 +157,7 @@ def test_a_far_forecast_alone_is_that_of_many_times(between_the_wells):
     assert distance.statistic < 1.95 / np.sqrt(DRAWS) + 0.01
 
 
+@pytest.mark.thorough
 def test_another_model_and_impossible_times_are_refused(known):
     keywords = {"model_kwargs": {"spread": NEAR}}
     for times, name in (([5.0, 4.0], "entry 1"), ([-1.0], "initial time"), ([], "at least one"), ([np.nan], "finite")):

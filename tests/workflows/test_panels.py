@@ -57,6 +57,7 @@ def test_the_plate_is_a_dimension_of_every_group(result):
     assert ResultView.of(result).group("trajectories")["times"].dims == ("patient", "at")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("series", [0, 1])
 def test_a_selected_series_is_smoothed_as_if_alone(result, series):
     view = lfm.select_series(result, LABELS[series])
