@@ -59,6 +59,7 @@ def test_two_doses_at_one_time_are_refused(files):
         lfm.read_csv(files / "drug.csv", ["blood"], inputs={"AMT": "dose:gut"})
 
 
+@pytest.mark.thorough
 def test_doses_of_a_file_reach_the_fit_and_the_forecast(files, run):
     status, _, errors = run(f"fit {files}/drug.py --data {files}/drug.csv --events AMT:gut --out out --sampler map "
                             "--samples 50")

@@ -207,6 +207,7 @@ def test_an_event_before_the_initial_time_or_at_no_time_has_no_density(lag):
     assert np.isnan(state)
 
 
+@pytest.mark.thorough
 def test_a_filter_that_continues_includes_the_events_before_its_start():
     times, y = np.array([1.0, 4.0, 5.0]), np.ones((3, 1))
 
@@ -218,6 +219,7 @@ def test_a_filter_that_continues_includes_the_events_before_its_start():
     np.testing.assert_allclose(jax.jit(continued)(0.0), continued(0.0), rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_simulation_without_noise_is_the_mean():
     model = absorption(1.3, 0.2, [lfm.Dose(DOSES, AMOUNTS, "gut"), lfm.Reset([7.0], "blood", 1.0)])
     state = lfm.simulate(jax.random.key(0), model, TIMES, steps=100).state
@@ -272,6 +274,7 @@ def test_a_continued_filter_equals_one_pass():
     np.testing.assert_allclose(second.filtered_mean, whole.filtered_mean[5:], atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_series_of_a_panel_have_doses_of_their_own():
     amounts, lags = jnp.array([[1.0, 2.0], [3.0, 0.0]]), jnp.array([0.5, 1.0])
 
@@ -286,6 +289,7 @@ def test_series_of_a_panel_have_doses_of_their_own():
     np.testing.assert_allclose(panel.log_prob(y), alone, rtol=1e-10)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("times", [[0.0, 0.2, 0.9], [0.0, 0.3, 0.9]])
 @pytest.mark.parametrize("observation_first", [True, False])
 def test_a_dose_of_a_panel_at_the_last_observation(times, observation_first):

@@ -65,6 +65,7 @@ def test_a_non_linear_model_integrates_an_infusion_between_its_ends():
     np.testing.assert_allclose(mean, exact, atol=1e-7)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("argument", ["rate", pytest.param("duration", marks=pytest.mark.thorough)])
 def test_gradients_in_amount_lag_and_rate_or_duration(argument):
     def log_prob(z):
@@ -105,6 +106,7 @@ def test_series_of_a_panel_have_infusions_of_their_own():
     np.testing.assert_allclose(panel.log_prob(np.stack([Y, Y])), alone, rtol=1e-8)
 
 
+@pytest.mark.thorough
 def test_a_filter_continues_within_an_infusion():
     model = decay([lfm.Infusion([0.0], 4.0, "blood", duration=4.0)], forces={})
     whole = lfm.filter(model, TIMES, Y)

@@ -46,6 +46,7 @@ def error(prediction, reference):
     return max(float(jnp.abs(a - b).max()) for a, b in zip(prediction.moments, reference.moments, strict=True))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", METHODS)
 def test_moments_converge_with_the_steps(method):
     reference = predict(RungeKutta(), CUBIC, 200)

@@ -118,6 +118,7 @@ def curved_observation():
         lfm.Gaussian(jnp.array([0.3]), jnp.array([0.2])), process_noise=jnp.array([[0.4]]), initial_time=0.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", [
     double_well(), motif(softplus, genes=1), pytest.param(curved_observation(), marks=pytest.mark.slow),
 ], ids=["state", "force", "observation"])

@@ -53,6 +53,7 @@ def stiff_linear(extra=None):
         lfm.Gaussian(jnp.array([1.0, -1.0]), 0.3 * jnp.eye(2)), process_noise=jnp.array([[3.0], [0.2]]))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rule", [
     lfm.Taylor(), pytest.param(lfm.Cubature(), marks=pytest.mark.thorough),
     pytest.param(lfm.Unscented(full_state=True), marks=pytest.mark.thorough)], ids=str)
@@ -169,6 +170,7 @@ def follower(rate, weather):
         lfm.Gaussian(jnp.array([weather(0.0)]), jnp.zeros((1, 1))), initial_time=0.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rate", [10.0, pytest.param(1e3, marks=pytest.mark.slow), 1e6])
 def test_a_tolerance_for_a_fast_state_that_follows_an_input(rate):
     """x' = r (10 + 5 sin(t / 3.8) - x), and the same with a table of the input that is linear between hours."""

@@ -71,6 +71,7 @@ def test_likelihood_filter_smoother_and_panel_say_it_and_compiled_code_does_not(
     assert not messages(lambda: jax.jit(lambda rate: lfm.filter(elimination(rate), ROWS, Y).log_likelihood)(10.0))[1]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rate", [30.0, pytest.param(300.0, marks=pytest.mark.slow)])
 def test_a_fast_linear_decay_to_a_function_of_a_force_needs_no_remedy(rate):
     model = lfm.LatentForceModel(

@@ -107,6 +107,7 @@ def test_the_constants_are_those_of_the_fit(order):
     assert_allclose(rational(order, result, omega), rational(order, expected, omega), rtol=1e-5, atol=1e-5 * delta)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_constants_are_optimal(order):
     delta, at = _FITS[order].delta, stored(order)
@@ -208,6 +209,7 @@ def draw(rng, count, driven=False, ell=None, sd=None):
     return ell, sd, times, y, exact
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("driven", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_log_likelihood_of_the_filter_is_that_of_the_exact_process(driven):
     rng = np.random.default_rng(5)

@@ -243,6 +243,7 @@ def test_fixed_parameters_and_settings(bound):
     assert finer.site.example.settings.steps == 9 and bound.site.example.settings.steps == 1
 
 
+@pytest.mark.thorough
 def test_a_model_that_asks_its_data_for_values():
     def looks(times, y=None):
         rate = numpyro.sample("decay", dist.LogNormal(float(np.nanmean(y)), 0.3))
@@ -256,6 +257,7 @@ def test_a_model_that_asks_its_data_for_values():
         assert float(result.log_density(z)) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.thorough
 def test_models_that_share_programs_may_have_other_numbers_of_series():
     def several(times, y=None):
         with numpyro.plate("series", y.shape[0]):
@@ -468,6 +470,7 @@ print(model_digest(lfm.bind(file.model, data.times, data.y, **file.keywords(data
     assert len(digests) == 1 and len(digests.pop().strip()) == 64
 
 
+@pytest.mark.thorough
 def test_gradients_of_a_model_with_a_loop_without_reverse_mode():
     """Four parameters, whose gradient is taken in reverse mode elsewhere."""
 

@@ -168,6 +168,7 @@ def test_trajectories_agree_with_the_exact_smoother_wherever_they_are_wanted():
         assert np.allclose(result.std(axis=0), sd, rtol=0.15)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("wrap", [lambda d: d.mask(jnp.array(True)), lambda d: d.expand((1,)).to_event(1)],
                          ids=["mask", "expand"])
 def test_a_likelihood_that_cannot_be_replaced_is_an_error(wrap):

@@ -72,6 +72,7 @@ def posterior_mean():
     return mean, np.sqrt(weight @ (grid - mean) ** 2)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("sampler", [pytest.param("ram", marks=pytest.mark.thorough), "nuts"])
 def test_samplers_have_the_posterior_of_the_product(sampler):
     result = lfm.fit(both, DATA, sampler=sampler, chains=2, warmup=150, samples=500, trajectory_draws=0,
