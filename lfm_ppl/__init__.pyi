@@ -31,6 +31,7 @@ from .inference.kernels.particle_marginal import ParticleMarginalRAM as Particle
 from .inference.kernels.ram import RAM as RAM
 from .inference.map import map_estimate as map_estimate
 from .io import data as data
+from .io import datasets as datasets
 from .io.data import read_csv as read_csv
 from .io.data import read_series as read_series
 from .io.data import read_table as read_table

@@ -11,6 +11,8 @@
 # %% [markdown]
 # # Quickstart: from a latent force model to a posterior
 #
+# **Question.** What did the factor do during the day, and how fast does the expression decay?
+#
 # A gene's expression $x$ is produced at a rate set by a transcription factor and decays:
 #
 # $$\frac{dx}{dt} = s\,\log(1 + e^{u(t)}) - d\,x, \qquad y_k = x(t_k) + e_k.$$
@@ -144,3 +146,8 @@ for name, settings in variants.items():
         for parameters in (at_mean, elsewhere)
     )
     print(f"{name:24} {here:21.2f} {there:18.2f} {there - here:12.2f}")
+
+# %% [markdown]
+# **Answer.** The decay rate is 0.65, 95% between 0.43 and 1.01. The band of the factor is narrow where there are data,
+# and widens to that of the prior after the last observation. The approximation changes little: log likelihood ratios
+# of the rules differ by 0.3 at most.

@@ -11,6 +11,9 @@
 # %% [markdown]
 # # The activity of p53 from its targets
 #
+# **Question.** When was p53 active, and do the rates of the genes depend on the shape that one assumes for their
+# response?
+#
 # After irradiation the tumour suppressor p53 is activated and switches on its target genes.
 # Barenco et al. (2006) measured the expression of five targets in human leukaemia cells, at seven
 # times in three replicates. The activity of p53 itself was not measured. The model:
@@ -215,3 +218,8 @@ for axes, colour, (link, one) in zip(panels, colours, results.items(), strict=Tr
     axes.set(title=link, xlabel="time (h)", ylim=(min(0.0, low.min()), None))
 panels[0].set_ylabel("activity, with 95%")
 plt.show()
+
+# %% [markdown]
+# **Answer.** The activity has its peak 3.9 hours after irradiation, 95% between 2.7 and 6.1 hours. The data cannot
+# tell the four shapes apart: all differences of the expected log predictive density are below 0.7, about two standard
+# errors at most. Rates and peak are similar under all four.

@@ -11,6 +11,9 @@
 # %% [markdown]
 # # Are the posteriors right? Simulation-based calibration
 #
+# **Question.** Do intervals of the filter's posterior hold the truth as often as they say, with an exact and with an
+# approximate likelihood?
+#
 # Draw parameters $\theta^*$ from the prior and data from the model at $\theta^*$. Then $\theta^*$ is itself one draw
 # from the posterior given these data, so among $L$ independent posterior draws its rank is uniform on $0, \dots, L$.
 # Repeated over many data sets, the histogram of the ranks must be level. A posterior that is too narrow shows as a
@@ -132,3 +135,7 @@ print(table.round(3).to_string())
 print(f"\nsmallest of {table.size} p-values: {table.to_numpy().min():.3f}")
 for (label, sampler), value in seconds.items():
     print(f"{label}, {sampler}: {data_sets} data sets in {value:.0f} s")
+
+# %% [markdown]
+# **Answer.** Yes. With 240 data sets of each kind the smallest of 40 p-values is 0.098. The error of the
+# approximation, for the softplus, cannot be seen in the ranks.

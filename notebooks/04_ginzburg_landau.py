@@ -118,3 +118,10 @@ scores.readable(result.tables["parameters"])
 
 # %%
 scores.readable(result.tables["comparison"])
+
+# %% [markdown]
+# **Answer.** A filter that takes tangents (EKF) is not usable here: its 99% intervals miss a true parameter in 84% of
+# the cases, where all others are known. Those of the CKF miss it in 16%, of the Gauss-Hermite filter in 27%, and of
+# the exact posterior in 3%, where 1% is nominal. With all parameters unknown the posteriors are wide, and 95%
+# intervals of the CKF cover as often as those of particle-marginal RAM (0.967 both), with a hundred times as many
+# effective draws per second.

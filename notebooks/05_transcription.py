@@ -11,6 +11,9 @@
 # %% [markdown]
 # # An unseen transcription factor: samplers on a grid, and a smoother that needs none
 #
+# **Question.** What does a Gaussian smoother without a grid lose against exact sampling on a grid, and what does it
+# save?
+#
 # $$\frac{dx_j}{dt} = B_j + S_j\, g(u(t)) - D_j\, x_j, \qquad y_{jk} = x_j(t_k) + e_{jk}, \quad
 # e_{jk} \sim N(0, 0.1^2),$$
 #
@@ -147,3 +150,9 @@ for label in chosen.links:
     print(f"{label}\n")
     print(lfm.check_accuracy(result, parameters.model, model_kwargs=keywords, draws=10 if quick else 200,
                              progress=False), "\n")
+
+# %% [markdown]
+# **Answer.** With iterated posterior linearisation it loses nothing: the error is that of elliptical slice sampling
+# under all responses, at a two-hundredth of its time or less. A single pass loses nothing under a saturating response,
+# and up to half under an exponential one. With unknown rates the posterior means are 0.34 sd from those of the grid at
+# most for the softplus, and 0.12 sd after the draws are weighted by posterior linearisation.

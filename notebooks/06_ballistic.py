@@ -11,6 +11,9 @@
 # %% [markdown]
 # # A target on reentry: its drag and the force on it, from distances alone
 #
+# **Question.** How well do distances alone determine drag and force, and would particles do better than a Gaussian
+# smoother?
+#
 # $$dr = -v\,dt + q_r\,d\beta_r, \qquad dv = \left(-\alpha e^{-\gamma r} v^2 + g + u(t)\right) dt + q_v\,d\beta_v,
 # \qquad y_k = \sqrt{s_x^2 + (s_y - r(t_k))^2} + e_k.$$
 #
@@ -33,12 +36,11 @@ import numpyro
 numpyro.set_host_device_count(2)
 numpyro.enable_x64()
 
-import jax
 import numpy as np
 import pandas as pd
 
+import lfm_ppl as lfm
 from lfm_ppl.io import loading
-from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 from lfm_ppl.studies import scores
 from lfm_ppl.studies.ballistic import figures, study
 
@@ -117,10 +119,15 @@ data = file.simulate()
 azimuth = data.y[:, 1]
 jump = int(np.abs(np.diff(azimuth)).argmax())
 print("azimuth about the jump (rad):", azimuth[jump - 2 : jump + 4].round(3))
-given = likelihood_site(file.model, (data.times,), {}, jax.random.key(0), data.truth["parameters"]).example
-smoothed = given.smooth(data.y)
+bound = lfm.bind(file.model, data.times, data.y)
+smoothed = bound.smooth(bound.unconstrain(data.truth["parameters"]))
 truth = np.asarray(data.truth["state"])[np.isin(data.truth["times"], data.times)]
 error = np.asarray(smoothed.mean)[:, :3] - truth[:, :3]
 sd = np.sqrt(np.diagonal(smoothed.covariance, axis1=1, axis2=2))[:, :3]
 summary = {"RMSE (m)": np.sqrt(np.mean(error**2, axis=0)), "coverage": np.mean(np.abs(error) < scores.Z * sd, axis=0)}
 pd.DataFrame(summary, ["east", "north", "up"]).round(3)
+
+# %% [markdown]
+# **Answer.** Altitude is known to 53 m, speed to 31 m/s and the force to 17 m/s², with bands that hold 95% of the
+# truth. The linearisation does not matter. A particle filter needs 10,000 particles, and 700 times the time, for the
+# same error. Drag and force explain the same data in part, so that the drag is known to 0.2 in its logarithm.

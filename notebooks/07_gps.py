@@ -11,6 +11,8 @@
 # %% [markdown]
 # # Orbits of GPS satellites: small forces that nobody measured
 #
+# **Question.** Do small forces, learnt from three days, predict the next seven days better than an orbit without them?
+#
 # $$\dot r = v, \qquad \dot v = a(r, t) + u_\mathrm{solar}(t)\, a_\mathrm{solar}(r, t) + R(r, t)\, u(t),$$
 #
 # where $a$ is the pull of the Earth (to degree and order 8), the Moon, the Sun and the solid tide, and
@@ -126,3 +128,8 @@ figures.plot_online(online.sel(satellite=name)) if online is not None else None
 
 # %%
 scores.readable(result.tables["learning"]) if "learning" in result.tables else None
+
+# %% [markdown]
+# **Answer.** Yes, for satellites without gaps in their record: the median error of 2.3 m is a twentieth of that of the
+# fitted orbit, and 26 of 28 satellites improve. The satellite G22, whose record has gaps, is 143 km off with every
+# method.

@@ -11,6 +11,8 @@
 # %% [markdown]
 # # Forces that repeat: eigenfunctions of periodic kernels
 #
+# **Question.** How many basis functions does a periodic force need, and are random frequencies as good?
+#
 # $$u(t) = \sum_{j=1}^{J} a_j(t)\,\phi_j(t), \qquad \int k(t, s)\,\phi_j(s)\,ds = \mu_j \phi_j(t),
 # \qquad a_j \sim \mathcal{GP}(0, \mu_j k_{quasi}).$$
 #
@@ -138,3 +140,9 @@ def likelihood(period):
 log_likelihood = jax.jit(jax.value_and_grad(likelihood))
 pd.DataFrame([(period, *map(float, log_likelihood(period))) for period in (9.0, 9.5, 10.0, 10.5, 11.0)],
              columns=["period", "log likelihood", "its derivative"]).round(2)
+
+# %% [markdown]
+# **Answer.** Few, if the kernel is smooth: eleven eigenfunctions leave out 0.0005 of the variance of the squared
+# exponential and 0.003 of Matern-5/2. Random frequencies are not as good: of a kernel that is not periodic, 88 of them
+# have an error of 0.15, and 22 eigenfunctions 0.004. Predictions with 22 eigenfunctions are those of the exact
+# process.

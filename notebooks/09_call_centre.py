@@ -11,6 +11,8 @@
 # %% [markdown]
 # # A call centre: queues tracked through days whose arrivals nearly repeat
 #
+# **Question.** How well is a queue predicted between few readings, if the arrivals repeat from day to day, nearly?
+#
 # $$\frac{dL}{dt} = -\Omega(t)\,\frac{L}{1 + L} + \zeta(t), \qquad y_k = L(t_k) + e_k.$$
 #
 # $L$ is the mean number of customers in the queue, $\Omega$ the known service rate, and $\zeta$ the unknown rate of
@@ -121,3 +123,8 @@ scores.readable(result.tables["agreement"])
 
 # %%
 scores.readable(result.tables["learnt"])
+
+# %% [markdown]
+# **Answer.** A quasi-periodic force has a quarter of the error of a force that knows nothing of days, and a half of
+# that of one whose days are all alike. Its bands hold 86% at the most likely parameters, and 95% with the parameters
+# integrated out.

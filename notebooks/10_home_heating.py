@@ -11,6 +11,9 @@
 # %% [markdown]
 # # Home heating: a day ahead, with residual heat that nearly repeats
 #
+# **Question.** How well is the temperature of a house predicted a day ahead, and what must be known of the residual
+# heat?
+#
 # The air in a home follows
 #
 # $$\dot T = \alpha\,(T_\mathrm{out} - T) + \beta E + R(t),$$
@@ -185,3 +188,8 @@ figures.plot_homes(settings, result.data)
 
 # %%
 figures.plot_scores(result.data)
+
+# %% [markdown]
+# **Answer.** To 0.45 K in a real house, if the residual may change from day to day; a force without a period has 0.66
+# K, and no residual 0.81 K. A residual that repeats exactly is the worst model: its bands are far too narrow. With
+# walls as a second store of heat these errors are 0.39 K, 0.52 K and 0.58 K.

@@ -130,3 +130,8 @@ result.data["parameters"].to_dataframe().round(3)
 
 # %%
 result.data["comparison"].sel({"method": "reference"}, drop=True)[["ess", "r_hat", "share"]].to_dataframe().round(3)
+
+# %% [markdown]
+# **Answer.** Good: means by expectation propagation are within 0.03 posterior standard deviations of exact sampling,
+# standard deviations within 4%, in a thousandth of its time. Laplace's method is off by up to 0.4 standard deviations.
+# Held-out data do not tell the methods apart.

@@ -11,6 +11,9 @@
 # %% [markdown]
 # # Forces that cannot be negative: full information, a moving horizon, and bands
 #
+# **Question.** Which of the known ways to estimate a force that cannot be negative has the smallest error, and can it
+# have honest bands?
+#
 # A concentration cannot be negative, but a Gaussian process can. Those who build moving horizon estimators respect such
 # bounds and have no posterior; those who have posteriors rarely respect them. Here are both:
 # `lfm.full_information`, `lfm.MovingHorizon` and `lfm.constrained_posterior`, in time linear in the record.
@@ -163,3 +166,9 @@ quick or figures.plot_peaks(result.data)
 
 # %%
 quick or scores.readable(result.tables["others"])
+
+# %% [markdown]
+# **Answer.** Full information with parameters from the whole record: its median squared error is 0.0009, that of the
+# smoother without bounds 0.0013, and that of a moving horizon as published 0.0054. Expectation propagation has honest
+# bands that respect the bounds: they hold 97% of the truth. In thyroid patients those of TRH, learnt from each
+# patient's own day, hold 93% of the truth, and the daily wave of TRH is found within an hour in every patient.

@@ -11,6 +11,9 @@
 # %% [markdown]
 # # Doses and many subjects: theophylline
 #
+# **Question.** How do absorption, clearance and volume differ between the subjects, and does first-order absorption
+# explain the data?
+#
 # Twelve subjects swallowed a dose of theophylline, a drug against asthma, and its concentration in their blood was
 # measured eleven times within a day, at times that differ between subjects. The model is that of
 # `lfm-ppl fit pharmacokinetics` with one compartment: gut and blood are amounts in mg per kg of body weight,
@@ -188,3 +191,8 @@ axis.plot(hours, np.asarray(curves).T, color="#0072B2", lw=0.8)
 axis.axhspan(10.0, 20.0, color="#E69F00", alpha=0.2, lw=0, label="therapeutic range, 10 to 20 mg/L")
 axis.set(xlabel="time (h)", ylabel="concentration (mg/L)", xlim=(0, 48), ylim=(0, None))
 _ = axis.legend(loc="lower right", frameon=False)
+
+# %% [markdown]
+# **Answer.** Between subjects the absorption rate varies by a factor of two (sd 0.68 of its logarithm), clearance by a
+# third (0.29) and volume by a sixth (0.16). First-order absorption explains the data: the unexplained input has a
+# scale of 0.02 mg/kg/h, 95% below 0.05. Pooling leaves the means and moves the subjects whose data say little.

@@ -11,6 +11,8 @@
 # %% [markdown]
 # # Fields in space and time: heat in a rod, events on a map
 #
+# **Question.** Where and when was the source, as seen by few sensors?
+#
 # A latent force may depend on the place. This notebook estimates
 #
 # - a heat source that nobody measured, from thermometers along a rod. Temperature $x$ and source $s$ are fields,
@@ -189,3 +191,7 @@ ends = [log_rate.min(), log_rate.max()]
 axis.plot(ends, ends, color="black", ls="--", lw=0.9)
 axis.set(xlabel="true field, log rate less its level", ylabel="posterior mean, 95%")
 print(f"{100 * np.mean(np.abs(log_rate - mean) < 1.96 * sd):.0f}% of the true values lie in their 95% intervals")
+
+# %% [markdown]
+# **Answer.** Eight thermometers show a source that moves along the rod, with a lengthscale of 0.11 m (95%: 0.07 to
+# 0.15). Of the map, all true log rates lie in their 95% intervals, from 832 events in 16 cells and 12 periods.

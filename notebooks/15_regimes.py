@@ -11,6 +11,8 @@
 # %% [markdown]
 # # Regimes: an open window, and the abrupt climate changes of the last glacial
 #
+# **Question.** When was the window open, and when did the climate change abruptly?
+#
 # Some systems obey one of several models at a time, and nobody has recorded which: a window is open or shut, the
 # climate is cold or warm. `lfm.Switching` takes one latent force model for each regime, and the rates $Q$ of a Markov
 # chain in continuous time,

@@ -63,6 +63,7 @@ def test_blank_cells_are_joined_held_or_zero(tmp_path):
             rates(["dose_rate"])
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 def test_the_command_line_maps_columns_to_the_model_s_names_and_unit(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

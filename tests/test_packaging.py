@@ -13,6 +13,7 @@ MODELS = {path.name for path in (ROOT / "models").glob("*.py")}
 STUDIES = {path.relative_to(ROOT / "studies") for path in (ROOT / "studies").rglob("*.py")}
 
 
+@pytest.mark.thorough
 def test_a_wheel_runs_outside_the_checkout(tmp_path):
     pytest.importorskip("hatchling", reason="builds the wheel; comes with the extra `test`")
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]

@@ -125,6 +125,7 @@ def test_a_jump_of_a_force_does_not_depend_on_the_process_noise(steps):
         assert abs(np.corrcoef(increment, jump)[0, 1]) < 5 / np.sqrt(len(keys))
 
 
+@pytest.mark.thorough
 def test_predictions_of_counts_are_independent():
     def model(times, y=None):
         level = numpyro.sample("level", dist.Normal(0.0, 1.0))

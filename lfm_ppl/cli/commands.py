@@ -52,7 +52,7 @@ STUDY_EXAMPLES = (
 app = App(
     name="lfm-ppl",
     help="Latent force models: from a model and data to a posterior.",
-    help_epilogue="Start with: lfm-ppl fit ginzburg-landau",
+    help_epilogue="Start with: lfm-ppl fit room",
     help_format="plaintext",
     help_formatter=TwoColumnFormatter(),
     version=f"lfm_ppl {lfm_ppl.__version__}",
@@ -130,7 +130,7 @@ def simulate(model: Model, /, *, options: SimulateOptions = SimulateOptions()) -
 
 
 @app.command(help_epilogue=_examples(
-    "fit ginzburg-landau",
+    "fit room",
     "fit transcription --data genes.csv --option link=saturation",
     "fit transcription --data p53.csv --set 'decay[CDKN1A]=0.8'",
     "fit spring --until 40 --target-accept 0.95",

@@ -38,6 +38,7 @@ def programs(line, folder):
     return sorted((folder / "cache").rglob("*-cache"))
 
 
+@pytest.mark.thorough
 def test_a_command_stores_its_programs_and_uses_them_again(tmp_path):
     assert programs("simulate spring --no-cache", tmp_path) == [] and not (tmp_path / "cache").exists()
     first = programs("simulate spring --overwrite", tmp_path)

@@ -92,9 +92,18 @@ def test_a_model_is_described(run, well, tmp_path):
     assert status == 2 and "how fast" in out and err == f"lfm-ppl: error: {broken}, line 3: not yet\n"
 
 
-def test_a_new_model_is_described_and_fitted_at_once(run):
+def test_a_new_model_is_described_and_simulated(run):
     assert run("new my_model.py")[0] == 0
     assert run("models my_model.py")[0] == 0
+    status, out, err = run("simulate my_model.py --seed 5 --out d.csv")
+    assert status == 0 and "lfm-ppl fit my_model.py --data d.csv" in out, err
+    expected = loading.load("my_model.py").simulate(seed=5)
+    np.testing.assert_array_equal(pd.read_csv("d.csv")[list(expected.outputs)], expected.y)
+
+
+@pytest.mark.thorough
+def test_a_new_model_is_fitted_at_once(run):
+    assert run("new my_model.py")[0] == 0
     status, out, err = run("fit my_model.py --sampler map --samples 50 --set noise_sd=0.3 --quiet --out result")
     assert status == 0 and "fixed    noise_sd = 0.3" in out, err
     posterior = ResultView.of(arviz_data.load("result")).posterior
@@ -120,6 +129,7 @@ def test_fit_writes_posterior_summary_figures_and_page(original):
     assert "<pre>lfm-ppl fit " in page and f"--quiet --until 8 --at 6.25 --out {original}</pre>" in page
 
 
+@pytest.mark.thorough
 def test_simulated_files_can_be_fitted(run, well, tmp_path):
     status, out, err = run(f"simulate {well} --seed 5 --option noise=0.2 --out d.csv")
     assert status == 0, err
@@ -171,6 +181,7 @@ def test_folders_are_numbered_and_not_left_empty(monkeypatch, tmp_path):
     assert not folder.exists()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("line", ["fit spring --out taken/r", "simulate spring --out taken/d.csv", "fit spring"])
 def test_a_path_that_cannot_be_written_is_an_error_before_the_computation(run, tmp_path, monkeypatch, line):
     monkeypatch.setattr("lfm_ppl.fit", lambda *task, **keywords: pytest.fail("it was computed"))
@@ -241,7 +252,7 @@ def test_a_warning_is_shown_once(capsys):
 
 @pytest.mark.slow
 def test_the_first_command_of_the_readme_does_not_diverge(run):
-    status, out, err = run("fit ginzburg-landau --out first")
+    status, out, err = run("fit room --out first")
     assert status == 0 and "diverged" not in out + err
     summary = arviz_data.summary(arviz_data.load("first"))
     assert summary["r_hat"].max() < 1.01 and summary["ess_bulk"].min() > 1000

@@ -59,6 +59,7 @@ def test_two_doses_at_one_time_are_refused(files):
         lfm.read_csv(files / "drug.csv", ["blood"], inputs={"AMT": "dose:gut"})
 
 
+@pytest.mark.thorough
 def test_doses_of_a_file_reach_the_fit_and_the_forecast(files, run):
     status, _, errors = run(f"fit {files}/drug.py --data {files}/drug.csv --events AMT:gut --out out --sampler map "
                             "--samples 50")
@@ -96,6 +97,7 @@ PANEL = MODEL.replace("""    ke = numpyro.sample("ke", dist.LogNormal(-1.0, 0.5)
 """)
 
 
+@pytest.mark.thorough
 def test_subjects_of_a_file_are_fitted_together_with_their_doses(files, run):
     (files / "panel.py").write_text(PANEL)
     rows = [f"{subject},{row}" for subject, shift in (("Ann", 0), ("Bo", 2)) for row in ROWS.splitlines()[1 + shift:]]

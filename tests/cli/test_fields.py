@@ -35,6 +35,7 @@ def simulate(seed=0):
 '''
 
 
+@pytest.mark.thorough
 def test_fields_are_stored_and_drawn_again(run, tmp_path):
     (tmp_path / "rod.py").write_text(ROD)
     status, output, errors = run("fit ./rod.py --sampler map --samples 20 --out rod --quiet")

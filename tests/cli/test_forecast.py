@@ -43,6 +43,7 @@ def test_a_forecast_writes_table_figures_group_and_scores(run, fitted, tmp_path)
     assert "held_out_data" not in ResultView.of(arviz_data.load(ahead)).groups
 
 
+@pytest.mark.thorough
 def test_predictions_are_replaced_only_with_overwrite(run, fitted):
     before = ResultView.of(arviz_data.load(fitted)).group("predictions")
     status, _, err = run(f"forecast {fitted} --at 9")

@@ -69,6 +69,7 @@ def evidence(case, draws):
     return float(jax.jit(likelihood.log_prob)(y)), reference(times, y, *bounds_by_side)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", [
     "state and force", *(pytest.param(case, marks=pytest.mark.slow) for case in CASES if case != "state and force")])
 def test_the_evidence_is_that_of_a_dense_normal_distribution(case):

@@ -57,6 +57,7 @@ def bounded():
                                    grid=TIMES)
 
 
+@pytest.mark.thorough
 def test_without_active_constraints_it_is_the_smoother():
     y = data(0)
     y[3:6] = np.nan

@@ -56,6 +56,7 @@ def test_a_window_that_holds_everything_is_full_information(delay):
     np.testing.assert_allclose(estimate.state_mean[distinct], full.state_mean, atol=1e-7)
 
 
+@pytest.mark.thorough
 def test_one_observation_at_a_time(tmp_path, caplog):
     """The same as the record at once, from a saved state too; nothing is compiled after the second call."""
     horizon = lfm.MovingHorizon(MODEL, window=WINDOW, delay=2, lower={"factor": 0.0})

@@ -43,6 +43,7 @@ def accepted(mean, covariance, low, high):
     return draws[((draws[:, 1::2] >= low) & (draws[:, 1::2] <= high)).all(axis=1)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("upper", [
     pytest.param({}, id="one bound", marks=pytest.mark.slow), pytest.param({"factor": 1.2}, id="two bounds")])
 def test_moments_bands_and_draws(dense, upper):

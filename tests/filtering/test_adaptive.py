@@ -69,6 +69,7 @@ def test_a_model_that_is_not_linear_in_its_force_only_is_integrated_to_the_toler
     np.testing.assert_allclose(reverse, gradient, rtol=1e-2)
 
 
+@pytest.mark.thorough
 def test_gradients_are_those_of_the_exact_integration_in_both_modes():
     at = SLOW_TO_STIFF[0]
     adaptive = lambda p: double_well(p, lfm.Taylor(), tolerance=1e-5).log_prob(Y)  # noqa: E731
@@ -208,6 +209,7 @@ class Last(eqx.Module):
         return x[-1:] / self.units[-1]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("units", [
     pytest.param(np.ones(4), id="alike", marks=pytest.mark.slow),
     pytest.param(np.array([1e-3, 1e3, 1.0, 30.0]), id="mixed units")])

@@ -91,6 +91,7 @@ def exact_log_likelihood(times, y, noise):
         return float(total)
 
 
+@pytest.mark.thorough
 def test_what_grows_beyond_all_digits_is_impossible_or_right():
     """After a gap of 169 a variance is 1e111, and what is left of it after an observation is rounding errors."""
     y = np.array([0.3, -0.4, 0.2, 0.1, 0.5])
@@ -111,6 +112,7 @@ def test_precision_lost_is_named():
         lfm.filter(unstable(1e-4), np.array([0.5, 169.0, 169.0, 170.0, 171.0]), np.full((5, 1), 0.1))
 
 
+@pytest.mark.thorough
 def test_an_uncertain_start_and_little_noise_are_no_failure():
     """Also where the first observation is exactly zero."""
     for noise, y in itertools.product((0.0, 1e-20, 1e-12), (0.0, 0.4)):

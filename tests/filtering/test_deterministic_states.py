@@ -202,6 +202,7 @@ def law_of_all(theta, f, y):
         stats.norm.logpdf(y[7], f, noise)])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("factors", [None, pytest.param("variational", marks=pytest.mark.slow),
                                      pytest.param("laplace", marks=pytest.mark.slow)])
 def test_all_families_add_their_densities(factors):

@@ -56,6 +56,7 @@ def test_a_covariance_for_each_time_needs_one_for_each():
             wrong()
 
 
+@pytest.mark.thorough
 def test_states_and_names_of_a_result():
     """Where a filter may start, and what its result has."""
     first = lfm.filter(MODEL, TIMES, Y)

@@ -32,7 +32,7 @@ def bateman(t, ka, ke):
     return np.where(t > 0, ka / (ka - ke) * (np.exp(-ke * t) - np.exp(-ka * t)), 0.0)
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.75])
+@pytest.mark.parametrize("lag", [pytest.param(0.0, marks=pytest.mark.thorough), 0.75])
 def test_doses_of_a_linear_model_superpose(lag):
     ka, ke = 1.3, 0.2
     model = absorption(ka, ke, [lfm.Dose(DOSES, AMOUNTS, "gut", lag=lag)])
@@ -133,6 +133,7 @@ def test_a_reset_before_an_observation_leaves_nothing_to_observe():
     np.testing.assert_allclose(value, dist.Normal(0.0, noise).log_prob(present).sum(), rtol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("is_linear", [True, False])
 def test_gradients_of_amounts_and_lags_equal_finite_differences(is_linear):
     y = np.sin(TIMES)[:, None] + 2.0
@@ -156,6 +157,7 @@ def test_gradients_of_amounts_and_lags_equal_finite_differences(is_linear):
     np.testing.assert_allclose(value, concrete, atol=1e-8 if is_linear else 5e-5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("observation_first", [True, False])
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0]])
 def test_traced_lags_leave_the_order_of_events_as_it_is(observation_first, order):
@@ -179,6 +181,7 @@ def decay(events):
         lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))), state_names=("c",), initial_time=0.0, events=events)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("lag", [-0.5, np.nan])
 def test_an_event_before_the_initial_time_or_at_no_time_has_no_density(lag):
     times, y = np.array([1.0, 5.0]), np.ones((2, 1))
@@ -205,6 +208,7 @@ def test_an_event_before_the_initial_time_or_at_no_time_has_no_density(lag):
     assert np.isnan(state)
 
 
+@pytest.mark.thorough
 def test_a_filter_that_continues_includes_the_events_before_its_start():
     times, y = np.array([1.0, 4.0, 5.0]), np.ones((3, 1))
 
@@ -216,6 +220,7 @@ def test_a_filter_that_continues_includes_the_events_before_its_start():
     np.testing.assert_allclose(jax.jit(continued)(0.0), continued(0.0), rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_simulation_without_noise_is_the_mean():
     model = absorption(1.3, 0.2, [lfm.Dose(DOSES, AMOUNTS, "gut"), lfm.Reset([7.0], "blood", 1.0)])
     state = lfm.simulate(jax.random.key(0), model, TIMES, steps=100).state
@@ -225,6 +230,7 @@ def test_simulation_without_noise_is_the_mean():
     assert lfm.filter(before, TIMES, ONES).predicted_mean[0, 1] == 1.0
 
 
+@pytest.mark.thorough
 def test_particles_agree_with_the_filter():
     model = absorption(1.3, 0.2, [lfm.Dose(DOSES, AMOUNTS, "gut"), lfm.Reset([7.0], "blood", 1.0)],
                        forces={"f": lfm.Matern(0.3, 4.0)})
@@ -234,6 +240,7 @@ def test_particles_agree_with_the_filter():
     np.testing.assert_allclose(result.log_likelihood.sum(), exact, atol=0.05)
 
 
+@pytest.mark.thorough
 def test_the_estimate_under_loose_bounds_is_the_smoothed_mean():
     for model in (absorption(1.3, 0.2, [lfm.Dose(DOSES, AMOUNTS, "gut")], forces={"f": lfm.Matern(0.3, 4.0)}),
                   flow_meter(TIMES[1:], 0.2)):
@@ -244,6 +251,7 @@ def test_the_estimate_under_loose_bounds_is_the_smoothed_mean():
         np.testing.assert_allclose(estimate.state_mean, smoothed.mean[:, :len(model.state_names)], atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_iterated_linearisation_finds_the_most_probable_trajectory():
     model = lfm.LatentForceModel(
         lambda x, u, t: jnp.stack([-x[0], x[0] - x[1] / (2.0 + x[1] ** 2) + u[0]]), {"f": lfm.Matern(0.5, 4.0)},
@@ -267,6 +275,7 @@ def test_a_continued_filter_equals_one_pass():
     np.testing.assert_allclose(second.filtered_mean, whole.filtered_mean[5:], atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_series_of_a_panel_have_doses_of_their_own():
     amounts, lags = jnp.array([[1.0, 2.0], [3.0, 0.0]]), jnp.array([0.5, 1.0])
 
@@ -281,6 +290,7 @@ def test_series_of_a_panel_have_doses_of_their_own():
     np.testing.assert_allclose(panel.log_prob(y), alone, rtol=1e-10)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("times", [[0.0, 0.2, 0.9], [0.0, 0.3, 0.9]])
 @pytest.mark.parametrize("observation_first", [True, False])
 def test_a_dose_of_a_panel_at_the_last_observation(times, observation_first):
@@ -305,6 +315,7 @@ def test_a_dose_before_the_start_of_a_series_is_refused():
         lfm.simulate(jax.random.key(0), build(np.zeros(1)), np.array([1.0, 2.0]))
 
 
+@pytest.mark.thorough
 def test_fit_and_forecast_with_a_dose_after_the_data():
     times = np.arange(1.0, 9.0)
     doses = np.array([0.0, 4.0, 10.0])

@@ -285,6 +285,7 @@ def log_evidence_of_a_count(link, y, mean, sd):
         return values.max() + np.log((np.exp(values - values.max()) * weights * half).sum())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("link", INVERSE_LINKS)
 def test_evidence_of_counts_of_any_size(link):
     """One count whose predictor has a prior near it or far off: value, and gradient by differences of the reference."""

@@ -112,7 +112,8 @@ def close(result, expected, tolerance=1e-9):
     assert np.abs(result - expected).max() <= tolerance * np.abs(expected).max()
 
 
-@pytest.fixture(scope="module", params=["previous", "linear", "noise"])
+@pytest.fixture(scope="module", params=["previous", *(
+    pytest.param(kind, marks=pytest.mark.thorough) for kind in ("linear", "noise"))])
 def case(request):
     """The compiled results of a kind of model as a function of its parameters, and its dense algebra."""
     settings = {"way": "previous", "varying_noise": True} if request.param == "noise" else {"way": request.param}
@@ -176,6 +177,7 @@ def concentration(rate, way="previous"):
     return 10.0 * (constant - (during - constant) / rate / 24.0) * np.exp(-rate * rest) / 20.0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("options", [{}, {"tolerance": 1e-4}, {"method": "exponential"}, {"steps": 1}], ids=str)
 def test_an_infusion_into_a_compartment_that_empties_within_minutes(options):
     for way in ("previous", "linear") if options in ({}, {"steps": 1}) else ("previous",):
@@ -186,6 +188,7 @@ def test_an_infusion_into_a_compartment_that_empties_within_minutes(options):
     assert lfm.MarginalLikelihood(infusion(10.0), HOURS, **options).description == "exact (the model is linear)"
 
 
+@pytest.mark.thorough
 def test_draws_of_a_state_without_noise_are_the_exact_path():
     smoothed = lfm.smooth(infusion(10.0), HOURS, np.zeros((4, 1)))
     draws = smoothed.sample(jax.random.key(0), 3).state[..., 0]
@@ -207,6 +210,7 @@ def test_a_dose_and_a_panel():
     np.testing.assert_allclose(panel.log_prob(y), expected, rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_one_regime_equals_the_linear_model():
     y = concentration(10.0)[:, None]
     switching = lfm.Switching({"a": infusion(10.0), "b": infusion(10.0)}, jnp.array([[0.0, 0.1], [0.2, 0.0]]), HOURS)
@@ -255,6 +259,7 @@ def test_other_functions_of_time_converge_and_are_stable():
         assert fine < coarse / (12.0 if rate < 1.0 else 3.5)
 
 
+@pytest.mark.thorough
 def test_fast_decay_of_a_model_that_is_not_linear_in_its_forces():
     """A state that follows exp(u) within minutes, whose moments are those of exp(u); the steps are as long as an hour.
 

@@ -103,6 +103,7 @@ def test_gradient_equals_central_differences(compiled, name, edge):
             index, reverse[index], difference)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name, theta, regular", [
     ("well", [1.0, -1e6, 0.5], [1.0, 0.7, 0.5]),
     pytest.param("oscillator", [1.0, 0.5, -1e6, 1.3, 0.1, 0.5], [1.0, 0.5, 0.7, 1.3, 0.1, 0.5], marks=pytest.mark.slow),

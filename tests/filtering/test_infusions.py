@@ -65,7 +65,8 @@ def test_a_non_linear_model_integrates_an_infusion_between_its_ends():
     np.testing.assert_allclose(mean, exact, atol=1e-7)
 
 
-@pytest.mark.parametrize("argument", ["rate", "duration"])
+@pytest.mark.thorough
+@pytest.mark.parametrize("argument", ["rate", pytest.param("duration", marks=pytest.mark.thorough)])
 def test_gradients_in_amount_lag_and_rate_or_duration(argument):
     def log_prob(z):
         share, stretch, lag = z
@@ -90,6 +91,7 @@ def test_gradients_in_amount_lag_and_rate_or_duration(argument):
         np.testing.assert_array_equal(gradient, 0.0)
 
 
+@pytest.mark.thorough
 def test_series_of_a_panel_have_infusions_of_their_own():
     durations = np.stack([DURATIONS, 2 * DURATIONS])
 
@@ -104,6 +106,7 @@ def test_series_of_a_panel_have_infusions_of_their_own():
     np.testing.assert_allclose(panel.log_prob(np.stack([Y, Y])), alone, rtol=1e-8)
 
 
+@pytest.mark.thorough
 def test_a_filter_continues_within_an_infusion():
     model = decay([lfm.Infusion([0.0], 4.0, "blood", duration=4.0)], forces={})
     whole = lfm.filter(model, TIMES, Y)
@@ -126,6 +129,7 @@ def test_fit_and_forecast_with_an_infusion_whose_rate_is_learnt():
     assert float(forecast[1, 0] - forecast[0, 0]) == pytest.approx(4.0 * (1 - np.exp(-0.6)) / 0.6, abs=1.5)
 
 
+@pytest.mark.thorough
 def test_constraints_take_infusions():
     model = decay([lfm.Infusion(STARTS, AMOUNTS, "blood", duration=DURATIONS)], lambda x, u, t: -RATE * x + u[0],
                   {"u": lfm.Matern(0.3, 4.0)})
@@ -160,6 +164,7 @@ def test_a_reset_without_a_state_is_one_of_all_states():
     np.testing.assert_allclose(smoothed.mean[3, 0], 3.0 * np.exp(-0.5), rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_regimes_take_the_events_of_one_model():
     events = [lfm.Infusion(STARTS, AMOUNTS, "blood", duration=DURATIONS), lfm.Dose([2.0], 1.5, np.ones(1)),
               lfm.Reset([6.0])]

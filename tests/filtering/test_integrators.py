@@ -46,6 +46,7 @@ def error(prediction, reference):
     return max(float(jnp.abs(a - b).max()) for a, b in zip(prediction.moments, reference.moments, strict=True))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", METHODS)
 def test_moments_converge_with_the_steps(method):
     reference = predict(RungeKutta(), CUBIC, 200)
@@ -54,6 +55,7 @@ def test_moments_converge_with_the_steps(method):
     assert fine < coarse / 3.0, "of order two at least"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", METHODS)
 def test_a_prediction_is_its_map_and_records_its_steps(method):
     start = Moments(*CUBIC.initial())
@@ -67,6 +69,7 @@ def test_a_prediction_is_its_map_and_records_its_steps(method):
     np.testing.assert_allclose(np.linalg.multi_dot(recorded.nodes.phi[::-1]), smoother.phi, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", METHODS)
 def test_adaptive_steps_reach_their_tolerance(method):
     reference = predict(RungeKutta(), CUBIC, 200)

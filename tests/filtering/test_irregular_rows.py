@@ -22,6 +22,7 @@ def log_prob(parameters, times=TIMES):
     return lfm.MarginalLikelihood(model, times).log_prob(Y)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("block", [8, 128])
 def test_stored_transitions_equal_tabulated_ones(monkeypatch, block):
     at = jnp.array([1.3, 0.4, 0.8])

@@ -119,6 +119,7 @@ def curved_observation():
         lfm.Gaussian(jnp.array([0.3]), jnp.array([0.2])), process_noise=jnp.array([[0.4]]), initial_time=0.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", [
     double_well(), motif(softplus, genes=1), pytest.param(curved_observation(), marks=pytest.mark.slow),
 ], ids=["state", "force", "observation"])
@@ -237,6 +238,7 @@ def test_moments_to_start_from_change_no_linear_model_and_belong_to_a_rule():
         lfm.MarginalLikelihood(double_well(), TIMES, tolerance=1e-3).anchor(Y)
 
 
+@pytest.mark.thorough
 def test_iterations_that_go_wrong_warn_outside_of_compiled_code():
     well, y = BREAKING[0]
     model, times, y = model_of(well), well.spacing * np.arange(1, len(BREAKING[0][1]) + 1), np.array(y)[:, None]
@@ -274,6 +276,7 @@ def test_limited_variances_keep_correlations_and_have_finite_derivatives():
     np.testing.assert_array_equal(limit_variance(moments, jnp.array([9.0, 9.0, 0.0])).covariance, covariance)
 
 
+@pytest.mark.thorough
 def test_the_default_is_near_the_exact_likelihood_of_double_wells():
     wells, y, exact = random_wells(WELLS)
     result = jax.jit(jax.vmap(smooth_well))(wells, jnp.asarray(y))

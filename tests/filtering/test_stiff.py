@@ -34,6 +34,7 @@ def test_robertson(options):
     np.testing.assert_allclose(likelihood.log_prob(y), 8 * np.log(1 / (0.01 * np.sqrt(2 * np.pi))), atol=1e-4)
 
 
+@pytest.mark.thorough
 def test_a_breakdown_names_the_method_for_stiff_dynamics():
     for options in ({}, {"tolerance": 1e-3}):
         with pytest.warns(lfm.FilterWarning, match='method="exponential" for stiff'):
@@ -52,7 +53,10 @@ def stiff_linear(extra=None):
         lfm.Gaussian(jnp.array([1.0, -1.0]), 0.3 * jnp.eye(2)), process_noise=jnp.array([[3.0], [0.2]]))
 
 
-@pytest.mark.parametrize("rule", [lfm.Taylor(), lfm.Cubature(), lfm.Unscented(full_state=True)], ids=str)
+@pytest.mark.thorough
+@pytest.mark.parametrize("rule", [
+    lfm.Taylor(), pytest.param(lfm.Cubature(), marks=pytest.mark.thorough),
+    pytest.param(lfm.Unscented(full_state=True), marks=pytest.mark.thorough)], ids=str)
 def test_a_stiff_linear_system_is_exact(rule):
     model, y = stiff_linear(), np.array([[0.9, -0.8], [0.1, 0.2], [0.4, np.nan], [0.3, 0.1]])
     exact = lfm.smooth(model, FORCE_TIMES, y)
@@ -105,6 +109,7 @@ def van_der_pol(mu=1.0, noise=0.3, start=1.0):
         lfm.Gaussian(jnp.array([start, 0.5]), 0.05 * jnp.eye(2)), process_noise=noise * jnp.eye(2), initial_time=0.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rule", [lfm.Taylor(), lfm.Cubature()], ids=["taylor", "cubature"])
 def test_order_of_convergence(rule):
     times, y = np.array([0.0, 1.0, 2.0]), np.array([[1.0, 0.4], [1.3, 0.1], [1.2, -0.4]])
@@ -119,6 +124,7 @@ def test_order_of_convergence(rule):
     assert np.log2(errors[0] / errors[1]) > 2.7 and np.log2(errors[1] / errors[2]) > 2.7, errors
 
 
+@pytest.mark.thorough
 def test_covariances_of_a_stiff_oscillator_are_semidefinite():
     y = np.full((7, 2), np.nan)
     y[0] = 2.0, 0.0
@@ -129,6 +135,7 @@ def test_covariances_of_a_stiff_oscillator_are_semidefinite():
             assert np.linalg.eigvalsh(covariance).min() >= -1e-12 * np.abs(covariance).max()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("options", [
     {"steps": 5}, pytest.param({"steps": 30, "tolerance": 1e-2}, marks=pytest.mark.slow)], ids=["steps", "tolerance"])
 def test_gradients(options):
@@ -163,6 +170,7 @@ def follower(rate, weather):
         lfm.Gaussian(jnp.array([weather(0.0)]), jnp.zeros((1, 1))), initial_time=0.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rate", [10.0, pytest.param(1e3, marks=pytest.mark.slow), 1e6])
 def test_a_tolerance_for_a_fast_state_that_follows_an_input(rate):
     """x' = r (10 + 5 sin(t / 3.8) - x), and the same with a table of the input that is linear between hours."""

@@ -53,6 +53,7 @@ def test_an_unstable_step_names_state_row_and_remedy():
         assert not said_again
 
 
+@pytest.mark.thorough
 def test_likelihood_filter_smoother_and_panel_say_it_and_compiled_code_does_not():
     likelihood = lfm.MarginalLikelihood(elimination(10.0), ROWS, iterations=0)
     panel = lfm.panel(elimination, jnp.array([1.0, 10.0]), ROWS, iterations=0)
@@ -70,6 +71,7 @@ def test_likelihood_filter_smoother_and_panel_say_it_and_compiled_code_does_not(
     assert not messages(lambda: jax.jit(lambda rate: lfm.filter(elimination(rate), ROWS, Y).log_likelihood)(10.0))[1]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rate", [30.0, pytest.param(300.0, marks=pytest.mark.slow)])
 def test_a_fast_linear_decay_to_a_function_of_a_force_needs_no_remedy(rate):
     model = lfm.LatentForceModel(
@@ -121,6 +123,7 @@ def stiff_model(times, y=None):
     numpyro.sample("y", lfm.MarginalLikelihood(elimination(rate), times, iterations=0), obs=y)
 
 
+@pytest.mark.thorough
 def test_a_panel_proposes_steps_for_its_fastest_series():
     panel = lfm.panel(elimination, jnp.array([1.0, 10.0, 40.0]), ROWS, iterations=0)
     y = np.stack([Y] * 3)
@@ -136,6 +139,7 @@ def switching(rate, times=ROWS):
     return lfm.Switching(models, 0.1 * (1.0 - np.eye(2)), times)
 
 
+@pytest.mark.thorough
 def test_regimes_are_named():
     likelihood = switching(10.0)
     said = messages(lambda: likelihood.log_prob(Y))[1]
@@ -161,6 +165,7 @@ def test_regimes_are_named_by_the_smoother_and_before_a_fit():
     assert len(said) == 1 and "at regime 'fast', row 0" in said[0]
 
 
+@pytest.mark.thorough
 def test_a_fit_says_it_before_it_samples():
     said = messages(lambda: lfm.fit(stiff_model, ROWS, Y, sampler="map", samples=2, trajectory_draws=0,
                                     progress=False))[1]

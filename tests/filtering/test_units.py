@@ -92,6 +92,7 @@ def smoothed(units, known, iterations):
             np.asarray(result.leave_one_out) + unit, np.asarray(result.log_likelihood) + unit)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("units", OTHERS.values(), ids=OTHERS)
 @pytest.mark.parametrize("known, iterations", [
     (True, 0), pytest.param(False, 0, marks=pytest.mark.slow), pytest.param(False, 2, marks=pytest.mark.slow)])

@@ -131,6 +131,7 @@ def test_second_order_in_the_width_of_a_cell():
     assert np.all((orders > 1.8) & (orders < 2.2)), orders
 
 
+@pytest.mark.thorough
 def test_stationary_density_of_the_double_well():
     result = fokker_planck(WELL, [0.0, 200.0], [[np.nan], [0.5]], cells=400, bounds=(-2.6, 2.6))
     # The drift is -(a x + b x^3) with a = -1, so that 2 Phi / sigma^2 is:
@@ -255,6 +256,7 @@ def test_batches_and_vmap_equal_loops(times):
     np.testing.assert_allclose(jax.jit(lambda t: jax.lax.map(log_density, t))(thetas), loop, rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_derivatives_in_forward_mode_and_failure():
     """Failure in compiled code is minus infinity."""
     ssm, grid = state_space(WELL), Grid(-3.0, 3.0, 60)

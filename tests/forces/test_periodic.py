@@ -161,6 +161,7 @@ def test_the_published_comparison():
         assert np.mean(off) > 0.1
 
 
+@pytest.mark.thorough
 def test_random_frequencies_have_the_kernel_as_their_mean():
     lag, count = np.array([0.0, 0.7, 3.0, 11.0]), 100_000
     periodic = forces.PeriodicMatern(1.0, 0.7, 8.0, 1)

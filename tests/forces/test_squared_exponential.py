@@ -107,6 +107,7 @@ def test_the_constants_are_those_of_the_fit(order):
     assert_allclose(rational(order, result, omega), rational(order, expected, omega), rtol=1e-5, atol=1e-5 * delta)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_constants_are_optimal(order):
     delta, at = _FITS[order].delta, stored(order)
@@ -166,6 +167,7 @@ def log_likelihood_error(order, times, ell, sd):
     return 0.5 * np.sum(values - 1.0 - np.log(values)) + 2.5 * np.sqrt(0.5 * np.sum((values - 1.0) ** 2))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("order", "sd", "error"), [
     (DEFAULT, 0.01, 0.0215), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
         (2, 1.0, 1.6), (2, 0.1, 18.5), (2, 0.01, 105.0), (4, 1.0, 0.076), (4, 0.1, 0.9), (4, 0.01, 24.5),
@@ -207,6 +209,7 @@ def draw(rng, count, driven=False, ell=None, sd=None):
     return ell, sd, times, y, exact
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("driven", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_log_likelihood_of_the_filter_is_that_of_the_exact_process(driven):
     rng = np.random.default_rng(5)

@@ -97,6 +97,7 @@ def test_many_data_sets_are_a_vmap():
     np.testing.assert_allclose(both, [bound.log_density(z), bound.log_density(z, OTHER)], rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_filter_and_smoother_at_a_draw_are_the_librarys_at_times_that_the_model_computes():
     def hours(times, y=None):
         rate = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
@@ -143,6 +144,7 @@ def test_what_decides_the_program_is_never_mixed_up():
         assert float(result.log_density(np.zeros(1))) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", [small, pytest.param(model, marks=pytest.mark.slow)], ids=["linear", "non-linear"])
 @pytest.mark.parametrize("sampler", ["map", *(pytest.param(name, marks=pytest.mark.slow) for name in ("nuts", "ram"))])
 def test_a_second_data_set_compiles_nothing(sampler, model):
@@ -214,6 +216,7 @@ def test_chains_from_the_mode_begin_with_the_covariance_there(monkeypatch):
     np.testing.assert_allclose(inverse_mass_matrix, mode.covariance)
 
 
+@pytest.mark.thorough
 def test_thinning_and_blocks_keep_the_last_step_of_each_draw(capfd, monkeypatch):
     monkeypatch.setattr("lfm_ppl.utils.progress.EVERY_S", 0.0)
     bound = lfm.bind(small, TIMES, Y)
@@ -240,6 +243,7 @@ def test_fixed_parameters_and_settings(bound):
     assert finer.site.example.settings.steps == 9 and bound.site.example.settings.steps == 1
 
 
+@pytest.mark.thorough
 def test_a_model_that_asks_its_data_for_values():
     def looks(times, y=None):
         rate = numpyro.sample("decay", dist.LogNormal(float(np.nanmean(y)), 0.3))
@@ -253,6 +257,7 @@ def test_a_model_that_asks_its_data_for_values():
         assert float(result.log_density(z)) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.thorough
 def test_models_that_share_programs_may_have_other_numbers_of_series():
     def several(times, y=None):
         with numpyro.plate("series", y.shape[0]):
@@ -335,7 +340,8 @@ def changed(kind, monkeypatch):
     }[kind]
 
 
-@pytest.mark.parametrize("kind", ["helper", "table", "method", "callable", "closure", "module"])
+@pytest.mark.parametrize("kind", ["closure", *(pytest.param(kind, marks=pytest.mark.thorough) for kind in (
+    "helper", "table", "method", "callable", "module"))])
 def test_a_model_is_what_its_function_computes_now(kind, monkeypatch):
     current, change = changed(kind, monkeypatch)
 
@@ -368,6 +374,7 @@ def test_a_digest_tells_models_that_need_the_values_of_their_data_apart():
     assert digests[0] == digests[1] != digests[2]
 
 
+@pytest.mark.thorough
 def test_times_may_follow_from_parameters_or_data():
     def warped(times, y=None):
         speed = numpyro.sample("speed", dist.LogNormal(0.0, 0.5))
@@ -463,6 +470,7 @@ print(model_digest(lfm.bind(file.model, data.times, data.y, **file.keywords(data
     assert len(digests) == 1 and len(digests.pop().strip()) == 64
 
 
+@pytest.mark.thorough
 def test_gradients_of_a_model_with_a_loop_without_reverse_mode():
     """Four parameters, whose gradient is taken in reverse mode elsewhere."""
 

@@ -189,6 +189,7 @@ def linear(y):
     numpyro.sample("y", dist.Normal(WEIGHTS @ x, NOISE).to_event(1), obs=y)
 
 
+@pytest.mark.thorough
 def test_the_posterior_of_a_linear_model_with_every_prior():
     mcmc = MCMC(EllipticalSlice(linear), num_warmup=300, num_samples=2000, num_chains=4, chain_method="vectorized",
                 progress_bar=False)

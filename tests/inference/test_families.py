@@ -201,6 +201,7 @@ def test_draws_of_the_prior_of_a_file_have_a_density_and_the_gradient_of_differe
     np.testing.assert_array_less(np.abs(gradient[chosen] - differences) / scale, 1e-5)
 
 
+@pytest.mark.thorough
 def test_shorter_steps_leave_no_failure():
     """The double well fails where it is stiff, and there only."""
     file = loading.load("ginzburg-landau")

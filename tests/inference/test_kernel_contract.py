@@ -84,6 +84,7 @@ def test_draws_have_the_posterior_of_each_data_set_and_depend_on_the_key(sampled
                                   [WARMUP + np.arange(1, SAMPLES + 1)] * CHAINS)
 
 
+@pytest.mark.thorough
 def test_thinned_chains_in_sequence_that_go_on_after_pickling_are_those_of_one_run(sampled):
     name, _, draws = sampled
     mcmc = chains(name, samples=SAMPLES // 2, chain_method="sequential", thinning=5)

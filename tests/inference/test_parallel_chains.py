@@ -1,5 +1,6 @@
 """Chains of `lfm.fit` on devices of their own, in a process that has two."""
 
+import pytest
 from processes import on_two_devices
 
 CODE = """
@@ -39,6 +40,7 @@ print("same")
 """
 
 
+@pytest.mark.thorough
 def test_parallel_chains_are_compiled_once_and_are_those_of_a_sequence():
     result = on_two_devices(CODE)
     assert result.stdout.strip() == "same", result.stderr

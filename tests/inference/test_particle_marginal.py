@@ -98,6 +98,7 @@ def test_noise_and_a_wrong_surrogate_leave_the_target_alone(surrogate):
         assert abs(values.mean() - moment) < 4.5 * values.std() / np.sqrt(effective(values))
 
 
+@pytest.mark.thorough
 def test_the_number_of_particles_is_chosen_for_an_sd_of_one():
     y = np.tile(Y, (4, 1))
     times = np.arange(24.0) / 4
@@ -121,6 +122,7 @@ def test_precise_observations_that_no_particle_meets_are_an_error(monkeypatch):
         potential.tune(jnp.array([-0.5]), jax.random.key(1))
 
 
+@pytest.mark.thorough
 def test_a_panel():
     """Two series share a rate: the estimate is the product of theirs, with independent particles."""
 
@@ -166,6 +168,7 @@ def test_trajectories_agree_with_the_exact_smoother_wherever_they_are_wanted():
         assert np.allclose(result.std(axis=0), sd, rtol=0.15)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("wrap", [lambda d: d.mask(jnp.array(True)), lambda d: d.expand((1,)).to_event(1)],
                          ids=["mask", "expand"])
 def test_a_likelihood_that_cannot_be_replaced_is_an_error(wrap):

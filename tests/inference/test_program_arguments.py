@@ -53,7 +53,8 @@ def patient(shift, amount, variance):
         "inputs": {"rate": table}, "R": np.full((6, 1, 1), variance), "units": {"u": "1/h", "time": "h"}}
 
 
-@pytest.mark.parametrize("model", [infusion, lagged, doses])
+@pytest.mark.parametrize("model", [
+    pytest.param(infusion, marks=pytest.mark.thorough), lagged, pytest.param(doses, marks=pytest.mark.thorough)])
 def test_other_times_inputs_and_errors_compile_nothing_and_give_their_own_density(model):
     def evaluate(patient, y):
         times, keywords = patient
@@ -94,6 +95,7 @@ def filtered(times, y=None, gain=None):
     numpyro.sample("y", lfm.MarginalLikelihood(built, times, steps=2, iterations=0), obs=y)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", [
     filtered, pytest.param(branching, marks=pytest.mark.slow), pytest.param(structured, marks=pytest.mark.slow)])
 def test_a_model_that_needs_values_is_compiled_for_them(model):
@@ -106,6 +108,7 @@ def test_a_model_that_needs_values_is_compiled_for_them(model):
         assert float(result) == pytest.approx(float(expected), rel=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_second_subject_of_fit_many_compiles_nothing():
     def model(times, y=None, inputs=None):
         rate = numpyro.sample("rate", dist.LogNormal(-1.0, 0.5))

@@ -13,6 +13,7 @@ import lfm_ppl as lfm
 Z = jnp.array([-0.7])
 
 
+@pytest.mark.thorough
 def test_the_log_density_is_the_sum_of_the_sites():
     bound = lfm.bind(both, TIMES, Y)
     singles = {name: lfm.bind(alone(name), TIMES[name], Y[name]) for name in Y}
@@ -44,6 +45,7 @@ def test_other_data_of_one_site_or_of_all():
         float(lfm.bind(alone("y2"), TIMES["y2"], other["y2"]).log_likelihood(Z)), abs=1e-12)
 
 
+@pytest.mark.thorough
 def test_sites_of_a_model_that_asks_its_data_for_values():
     def looks(times, y):
         rate = numpyro.sample("a", dist.LogNormal(float(np.nanmean(y["y"])), 0.5))

@@ -95,6 +95,7 @@ def predicted(data):
     return np.asarray(lfm.filter(model, data.times, data.y, max_step=0.05).predicted_mean)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 20))])
 def test_a_dosing_file_is_the_history_that_it_describes(seed, read):
     text, doses, resets = random_file(seed)

@@ -57,6 +57,7 @@ def test_it_is_exact_for_a_linear_model(method, variance):
     assert np.allclose(draws.std(axis=0), result.sd[0], rtol=5 / np.sqrt(2 * 20_000))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("link", [
     pytest.param(jax.nn.softplus, id="softplus"),
     pytest.param(jnp.exp, id="exponential", marks=pytest.mark.slow),

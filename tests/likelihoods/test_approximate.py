@@ -106,9 +106,11 @@ def test_settings_of_a_likelihood_are_its_defaults_and_what_was_given():
 
 @pytest.mark.parametrize("likelihood", [
     lfm.MarginalLikelihood(build(1.0), TIMES, steps=3),
-    lfm.ConstrainedLikelihood(build(1.0), TIMES, steps=3, lower={"u": -9.0}, draws=0, grid=5),
+    pytest.param(lfm.ConstrainedLikelihood(build(1.0), TIMES, steps=3, lower={"u": -9.0}, draws=0, grid=5),
+                 marks=pytest.mark.thorough),
     lfm.panel(build, jnp.array([0.5, 1.0]), TIMES, steps=3),
-    lfm.Switching({"a": build(1.0), "b": build(2.0)}, [[0.0, 0.1], [0.2, 0.0]], TIMES, steps=3),
+    pytest.param(lfm.Switching({"a": build(1.0), "b": build(2.0)}, [[0.0, 0.1], [0.2, 0.0]], TIMES, steps=3),
+                 marks=pytest.mark.thorough),
 ], ids=["series", "constrained", "panel", "regimes"])
 def test_open_settings_are_completed_and_named_ones_stay(likelihood):
     def open_model(times, y=None):

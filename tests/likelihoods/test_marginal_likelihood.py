@@ -78,6 +78,7 @@ def test_gradient_agrees_in_both_modes_and_with_the_exact_density(y, batch):
                 np.testing.assert_allclose(gradients[name][which][index], difference, rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_traced_times_give_the_exact_value_and_a_finite_derivative_at_replicates(y):
     traced = jax.jit(jax.value_and_grad(lambda times: log_likelihood(THETA, y, times)))
     for times, start in ((TIMES, 0.0), (TIMES * 1.7 + 3.0, 3.0)):
@@ -217,6 +218,7 @@ def test_impossible_parameters_have_minus_infinity_and_zero_gradients(failures):
     np.testing.assert_array_equal(forward, np.zeros((len(IMPOSSIBLE), 3)))
 
 
+@pytest.mark.thorough
 def test_impossible_parameters_in_a_batch_leave_the_others_alone(failures):
     times, y = np.arange(6.0), np.ones((6, 1))
     single = jax.jit(double_well)

@@ -65,6 +65,7 @@ def together():
     return lambda *arguments: jax.tree.map(np.asarray, compiled(*arguments))
 
 
+@pytest.mark.thorough
 def test_requested_times_that_are_traced_are_nodes(y):
     """With a known input, whose jump divides intervals and their steps."""
     heat = lfm.Input([0.0, 0.8, 2.2], [0.0, 1.0, 0.3], interpolation="previous", outside="hold")
@@ -101,6 +102,7 @@ def test_panel_equals_a_loop(y, looped):
     np.testing.assert_allclose(by_lengthscale, sum(e[1][1] for e in results), rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.thorough
 def test_many_series_go_one_after_another_on_a_cpu(y, monkeypatch):
     """To the same values and gradients as side by side, with times of their own."""
     count = 9

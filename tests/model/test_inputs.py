@@ -63,6 +63,7 @@ def test_jumps_at_rows_are_exact_in_a_linear_model():
     assert result[1] == 0.0, "nothing moves before the jump"
 
 
+@pytest.mark.thorough
 def test_jumps_at_rows_keep_the_order_four():
     model = pushed(lambda x, u, t: STEP(t) - x - x**3)
     exact = response(lambda x, v: v - x - x**3)
@@ -111,6 +112,7 @@ def test_reading_beyond_the_table_is_told(dynamics):
     assert ENDED in message and 'outside="hold"' in message
 
 
+@pytest.mark.thorough
 def test_reading_is_told_everywhere():
     model, y = pushed(Heated(LINE)), np.zeros((4, 1))
     for call in (lambda: lfm.filter(model, ROWS, y), lambda: lfm.MarginalLikelihood(model, ROWS).ssm,

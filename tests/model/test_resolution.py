@@ -54,6 +54,7 @@ def test_estimate_is_the_true_error(order):
                         assert result.error < TOLERANCE
 
 
+@pytest.mark.thorough
 def test_the_error_is_estimated_through_the_dynamics():
     # What a slow state shows of the force has less of its high frequencies, so that a low order does.
     times = np.linspace(0.0, 1.0, 100)
@@ -121,6 +122,7 @@ def test_only_what_is_observed_counts():
     assert padded.error == observed.error < resolutions(one, times)[0].error
 
 
+@pytest.mark.thorough
 def test_the_noise_of_most_rows_counts():
     """A covariance for each time, the first of which is tiny."""
     times = np.linspace(0.0, 10.0, 21)

@@ -138,6 +138,7 @@ def test_the_law_does_not_depend_on_the_requested_times():
         within_monte_carlo_error(np.asarray(draw(keys)), np.ones(1), np.array([[0.01]]))
 
 
+@pytest.mark.thorough
 def test_what_is_not_finite_is_said():
     model = lfm.LatentForceModel(lambda x, u, t: x**2, {}, lfm.GaussianObservation(whole_state, jnp.ones(1)),
                                  lfm.Gaussian(jnp.ones(1), jnp.zeros((1, 1))), state_names=("x",), initial_time=0.0)

@@ -78,6 +78,7 @@ def test_the_estimate_is_the_error_of_dense_algebra(name):
                 assert error(*covariances(times, result.functions - 2, kernel, sd)) > TOLERANCE / 1.7
 
 
+@pytest.mark.thorough
 def test_the_loss_of_a_trend_and_a_season():
     """Weekly CO2: 99.97% of the variance is kept, and nats of the log likelihood of data of the kernel are lost."""
     evolution, trend = lfm.Matern(1.0, 40.0, 1), lfm.Matern(20.0, 30.0, 1)
@@ -103,6 +104,7 @@ def test_the_loss_of_a_trend_and_a_season():
     np.testing.assert_allclose(of_filter, exact[0], atol=TOLERANCE)
 
 
+@pytest.mark.thorough
 def test_the_error_is_estimated_through_the_dynamics():
     """dx/dt = 6 (u - x), by the trapezoidal rule."""
     cycles, rows, functions, sd, accuracy = 8, 24, 7, 0.01, 0.1

@@ -54,6 +54,7 @@ def likelihoods():
     return data, jax.jit(run)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("bearing", [np.pi, 2.0, -40.0])
 def test_turning_the_radar_changes_nothing(likelihoods, bearing):
     """The azimuth of the default data wraps; with the axis turned to the target it does not. The answer is the same."""

@@ -18,7 +18,7 @@ from lfm_ppl.io.data_set import Data
 from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 
 MODELS = sorted(loading.available())
-CHEAP = ("spring", "ginzburg-landau", "ballistic")
+CHEAP = ("spring", "ginzburg-landau", "ballistic", "room")
 """Models that are simulated from the prior by default; of others the density alone is asked for."""
 
 COSTLY = ("ballistic-3d", "call-centre", "epidemic", "gps", "home-heating", "thyroid")

@@ -27,6 +27,7 @@ def test_no_draw_of_the_prior_has_a_density_or_gradient_that_is_nan(file, count)
     assert np.all(np.isfinite(values))
 
 
+@pytest.mark.thorough
 def test_a_figure_has_one_panel_for_all_regimes_also_of_a_forecast_and_of_a_choice(file, tmp_path):
     data = file.simulate()
     result = lfm.fit(file.model, data.times[-60:], data.y[-60:], sampler="map", samples=40, trajectory_draws=40,

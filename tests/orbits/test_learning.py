@@ -23,6 +23,7 @@ def test_common_magnitudes_are_the_mean_and_the_scatter_of_the_satellites():
         magnitudes.common(several[:4], "DYB").mean, magnitudes.wide("DYB").mean)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("axes", "size", "states"), [("DYB", 21, 27), ("RTN", 34, 1 + 15 + 15 + 21)])
 def test_magnitudes_become_forces(axes, size, states):
     names = magnitudes.names(axes)
@@ -66,6 +67,7 @@ def test_where_positions_say_nothing_the_prior_is_left():
     assert np.cov(target.draws(prior.mean, 20_000).T) == pytest.approx(np.diag(prior.sd**2), abs=0.16)
 
 
+@pytest.mark.thorough
 def test_a_breakdown_turns_the_search_back():
     def evidence(z):
         value = -0.5 * float(z @ z) if z[0] > -1.0 else np.nan

@@ -134,6 +134,7 @@ def test_the_period_of_an_orbit_is_that_of_kepler_along_an_ellipse_too():
             orbits.period_of(wrong)
 
 
+@pytest.mark.thorough
 def test_any_force_can_act_on_a_satellite(around):
     start = lfm.Gaussian(jnp.asarray(START), jnp.eye(6))
     with pytest.raises(ValueError, match="axes"):

@@ -91,6 +91,7 @@ def describe_process(task):
             "environment": " ".join(os.environ[name] for name in variables)}
 
 
+@pytest.mark.thorough
 def test_workers_have_one_thread_and_share_the_cache_of_compiled_programs(workers):
     processes = run_tasks(tasks(8), describe_process, None, workers=workers).values()
     assert len({process["process"] for process in processes} - {os.getpid()}) == 2
@@ -132,6 +133,7 @@ def die(task):
     return noise(task)
 
 
+@pytest.mark.thorough
 def test_a_task_whose_worker_died_is_computed_again(tmp_path, workers):
     result = run_tasks(tasks(deaths={"noise/001": 1}, folder=str(tmp_path)), die, None, workers=workers)
     assert_same(result, run_tasks(tasks(), noise, None))
@@ -208,6 +210,7 @@ def test_one_process_needs_no_dask(monkeypatch):
         run_tasks(tasks(), noise, None, workers=2)
 
 
+@pytest.mark.thorough
 def test_a_scheduler_with_workers_that_were_started_by_hand(tmp_path, monkeypatch):
     file = tmp_path / "scheduler.json"
     processes = [start_python("-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",

@@ -66,6 +66,7 @@ def test_the_likelihood_is_unbiased(resampling, threshold):
     assert_unbiased(estimated, exact)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model, scheme, steps", [
     (driven(), "exact", 1), pytest.param(driven(order=0), "srk", 40, marks=pytest.mark.slow),
     pytest.param(driven(), "srk", 20, marks=pytest.mark.slow),

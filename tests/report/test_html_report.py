@@ -155,6 +155,7 @@ def test_all_text_is_escaped(groups, attrs, tmp_path):
     assert "d<b>" in page.texts["result"] and not {"b", "script"} & set(page.tags)
 
 
+@pytest.mark.thorough
 def test_a_posterior_alone_and_a_call_in_python(groups, tmp_path):
     page = read(save({"posterior": groups["posterior"]}, {"call": "lfm.fit(gene, data)"}, tmp_path / "mine.html"))
     assert list(page.texts) == ["result", "accuracy", "convergence", "model", "data", "repeat"]

@@ -56,6 +56,7 @@ def test_average_is_the_log_of_the_mean_with_the_variance_of_the_jackknife():
     assert np.isnan(importance_weights.average(np.zeros((2, 1))).variance).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("coefficient", [0.0, 0.6], ids=["independent", "autocorrelated"])
 @pytest.mark.parametrize("noise", [0.0, 0.3], ids=["exact ratios", "noisy ratios"])
 def test_corrected_moments_are_right_within_calibrated_errors(coefficient, noise):
@@ -276,6 +277,7 @@ def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     assert ResultView.of(corrected).attrs["sampler"] == "nuts + importance resampling"
 
 
+@pytest.mark.thorough
 def test_the_report_survives_the_file(checked, tmp_path):
     result, report = checked
     path = arviz_data.save(result, tmp_path / "posterior.nc")
@@ -285,6 +287,7 @@ def test_the_report_survives_the_file(checked, tmp_path):
     assert again.table.equals(report.table)
 
 
+@pytest.mark.thorough
 def test_densities_keep_to_the_support_and_their_mass_and_are_dashed_where_unreliable(checked):
     result, report = checked
     draws = np.abs(np.random.default_rng(0).normal(size=(1, 6000)))  # half a normal: densest at the end of its support
@@ -306,6 +309,7 @@ def test_densities_keep_to_the_support_and_their_mass_and_are_dashed_where_unrel
         assert corrected.get_xdata().min() >= 0.0
 
 
+@pytest.mark.thorough
 def test_correction_keeps_data_truth_and_the_layout_of_trajectories(checked):
     result, report = checked
     assert report.reliable
@@ -347,6 +351,7 @@ def test_a_panel_is_the_sum_of_its_series():
     assert np.abs(particles.log_ratio - together.log_ratio).max() < 5 * particles.noise_sd + 0.02
 
 
+@pytest.mark.thorough
 def test_enough_particles_are_found(bent):
     """The pilot raises the number until the noise is below its target."""
     problem = rebuilding.problem(bent, well).select(np.arange(0, 400, 25))
@@ -359,6 +364,7 @@ def test_enough_particles_are_found(bent):
     assert limited.particles == 1000 and limited.limited
 
 
+@pytest.mark.thorough
 def test_more_particles_are_run_only_until_the_verdict_is_settled(bent, monkeypatch):
     problem = rebuilding.problem(bent, well).select(np.arange(0, 400, 50))
     settings = log_likelihoods.ReferenceSettings("particles", None, 2)
@@ -381,6 +387,7 @@ def test_replicates_of_each_series_are_averaged_apart():
     np.testing.assert_allclose(averaged.variance, parts.variance.sum())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("changes", "name"), [
     ({"reference": "exact"}, "reference"), ({"draws": 0}, "draws"), ({"particles": 0}, "particles"),
     ({"replicates": 1}, "replicates"), ({"steps": 0}, "steps"), ({"y": Y[:3]}, "y"),
@@ -391,6 +398,7 @@ def test_mistakes(bent, changes, name):
         check_accuracy(bent, well, progress=False, **changes)
 
 
+@pytest.mark.thorough
 def test_mistakes_about_the_result(bent, linear):
     posterior, observed = (ResultView.of(bent).group(name) for name in ("posterior", "data"))
     for groups, attrs, model, name in (

@@ -53,6 +53,7 @@ def test_the_default_likelihood_of_a_positive_force_is_iterated():
     assert not any("iterations" in message for message in messages)
 
 
+@pytest.mark.thorough
 def test_a_single_pass_is_reported_with_the_cheapest_remedy():
     result, messages = fit(iterations=0)
     attrs = ResultView.of(result).attrs

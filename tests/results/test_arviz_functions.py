@@ -74,6 +74,7 @@ def test_a_panel_with_padded_rows_and_a_series_without_data():
     assert ResultView.of(lfm.select_series(result, 2)).group("observed_data")["y"].size == 0
 
 
+@pytest.mark.thorough
 def test_two_sites_of_several_outputs_and_series():
     times, y = {"one": TIMES[0], "many": TIMES[1:]}, {"one": Y[0] * np.array([1.0, 2.0]), "many": Y[1:].copy()}
     y["one"][[1, 3], [0, 1]], y["many"][1, 3:] = np.nan, np.nan
@@ -92,6 +93,7 @@ def test_two_sites_of_several_outputs_and_series():
                                atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_counts_with_missing_entries():
     y = np.random.default_rng(2).poisson([3.0, 8.0], size=(8, 2)).astype(float)
     y[2], y[5, 1] = np.nan, np.nan

@@ -64,6 +64,7 @@ def test_new_counts_are_counts_and_so_are_their_intervals(result, ahead):
     assert np.all(ends == np.round(ends)) and np.all(ends[:, 0] < ends[:, 1])
 
 
+@pytest.mark.thorough
 def test_counts_have_residuals(result):
     residual = ResultView.of(result).group("one_step_ahead")["residual"]
     assert np.all(np.isfinite(residual))
@@ -76,6 +77,7 @@ def test_counts_have_residuals(result):
     assert "residuals" in {name for name, *_ in pages_of(result, "column")}
 
 
+@pytest.mark.thorough
 def test_log_score_is_that_of_the_family_along_the_paths(ahead):
     """Against SciPy: the mean over the draws of the Poisson probability at each path's own rate."""
     predicted, posterior = (ResultView.of(ahead).group(name) for name in ("predictions", "posterior"))
@@ -129,6 +131,7 @@ def test_check_by_importance_sampling_and_correction(result):
                            draws=4, particles=10, replicates=2, progress=False)
 
 
+@pytest.mark.thorough
 def test_unconverged_factors_are_counted_and_named(result):
     """With few sweeps allowed they converge at some points and not at others."""
     stored = json.loads(ResultView.of(result).attrs["factor_failures"])

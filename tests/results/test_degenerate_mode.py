@@ -50,6 +50,7 @@ def fitted(y, **keywords):
                        model_kwargs=keywords)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("keywords", [{"prior": "half normal"}, {"prior": "log normal", "unit": 1e3}],
                          ids=["no mode", "a mode far out"])
 def test_a_group_that_collapses_is_named_everywhere(y, keywords, tmp_path):
@@ -75,6 +76,7 @@ def test_a_proper_mode_gives_no_warning(y):
     assert "warnings" not in arviz_data.summary(result)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("floor", [0.0, 1e-6], ids=["known well", "only bounded"])
 def test_a_small_parameter_that_the_data_ask_for_gives_no_warning(floor):
     """A standard deviation at 1e-6 of its prior; with as much noise besides, it is only known to be no larger."""

@@ -165,6 +165,7 @@ def test_away_from_the_edges_the_source_has_the_covariance_of_its_kernel():
         np.testing.assert_allclose(weights @ weights.T, kernel.covariance(places[:, None], places), atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_sensors_may_move():
     basis, _, still = equation("heat", "dirichlet", 1, sensors=np.linspace(0.1, 0.9, 5))
     moving = equation("heat", "dirichlet", 1, sensors=lambda t: jnp.array([0.1 + 0.4 * t]))[2]
@@ -182,6 +183,7 @@ def test_sensors_may_move():
         assert lfm.MarginalLikelihood(outside, TIMES).log_prob(y) == -np.inf
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["heat", "wave"])
 def test_gradients(kind):
     basis = lfm.LaplaceBasis((0.0, 1.0), 6)
@@ -200,6 +202,7 @@ def test_gradients(kind):
     np.testing.assert_allclose(jax.jit(jax.grad(log_density))(theta), differences, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_stiff_or_smooth_expansion_has_finite_gradients():
     """Densities of the last modes underflow, and their rates are large."""
     basis = lfm.LaplaceBasis((0.0, 1.0), 40)

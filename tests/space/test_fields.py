@@ -49,6 +49,7 @@ def test_equals_a_dense_process_and_its_kriging(dimension, kernel, reference):
     np.testing.assert_allclose(field.weights(points)[0], field.root, atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_a_low_rank_is_enough_for_a_smooth_field():
     points = np.linspace(0.0, 1.0, 40)
     field = lfm.SeparableField(points, lfm.SquaredExponential(2.0, 0.4), lfm.Matern(1.0, 1.0), rank=8)
@@ -61,6 +62,7 @@ def test_a_low_rank_is_enough_for_a_smooth_field():
         lfm.SeparableField(points, lfm.SquaredExponential(2.0, 0.4), lfm.Matern(1.0, 1.0), rank=2)
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore::lfm_ppl.ApproximationWarning")
 @pytest.mark.parametrize("rank", [3, 6, 9])
 def test_gradients(rank):

@@ -77,6 +77,7 @@ def dense_cost(rate, frozen, weight, times, y):
     return free + excess + 1e-2 * (rate - np.sqrt(3.0)) ** 2, force @ path
 
 
+@pytest.mark.thorough
 def test_the_rate_as_a_constant_state_against_a_search_on_the_dense_cost():
     """The printed cost with the rate among the states, and forces that cannot be negative."""
     times = np.linspace(0.0, 6.0, 25)

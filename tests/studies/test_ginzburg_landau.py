@@ -30,6 +30,7 @@ def test_every_method_filters_and_smooths(method):
     assert result["seconds"] > 0.0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", [
     pytest.param(method, marks=() if method == "CKF" else pytest.mark.slow) for method in problem.METHODS])
 def test_every_method_has_conditional_posteriors(method):
@@ -43,6 +44,7 @@ def test_every_method_has_conditional_posteriors(method):
     np.testing.assert_array_equal(outcomes["outside"], np.abs(outcomes["below"] - 0.5) > 0.495)
 
 
+@pytest.mark.thorough
 def test_the_grid_gives_the_same_likelihood_in_one_step_and_in_twenty():
     """exp(2 A) = exp(0.1 A)^20: the fine times change nothing."""
     single_step = states.compute(task("state", "grid"))["log_likelihood"]

@@ -29,6 +29,7 @@ def learning_result(value=0.0, orbit=range(8)):
     return {"orbit": np.array(orbit, float), "logarithms": np.full(len(magnitudes.names("DYB")), value), "cpu_s": 1.0}
 
 
+@pytest.mark.thorough
 def test_predictions_follow_learning_and_use_the_group_prior(data):
     settings = study.GpsSettings(data="folder", alternatives=2)
     first = study.learning_tasks(settings)

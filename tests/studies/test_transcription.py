@@ -33,6 +33,7 @@ def test_the_data_solve_the_equation():
     assert abs(noise.mean()) < 4 / np.sqrt(noise.size) and abs(noise.std() - 1) < 4 / np.sqrt(2 * noise.size)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", [
     pytest.param(method, marks=() if method == "LA, trust region" else pytest.mark.slow)
     for method in study.METHODS])

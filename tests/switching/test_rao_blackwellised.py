@@ -71,6 +71,7 @@ def predicted():
     return lfm.rao_blackwellised(jax.random.key(1), house, THERMOSTAT, TIMES, particles=1000)
 
 
+@pytest.mark.thorough
 def test_the_prediction_is_that_of_a_hundred_times_the_plain_particles(predicted):
     """Whole states drawn with matrix exponentials, without any of this library."""
     agree(predicted, *by_hand(np.random.default_rng(0), 100_000))
@@ -269,6 +270,7 @@ def test_an_observation_comes_before_the_decision_at_its_time():
     assert np.isfinite(result.log_likelihood).all() and result.log_likelihood[0] > 0.0
 
 
+@pytest.mark.thorough
 def test_a_model_that_asks_for_the_value_in_python_has_a_covariance_for_each_particle():
     rates = {0.0: ALPHA, 1.0: ALPHA}
     assert not is_input_additive(lambda heater: house(heater, rates[heater]))

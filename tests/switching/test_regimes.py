@@ -134,7 +134,8 @@ def test_the_density_equals_enumeration_where_merging_is_exact(case, merging):
     np.testing.assert_allclose(smoothed.probability, exact.probability, atol=0.07)
 
 
-@pytest.mark.parametrize(("merging", "rows"), [("gpb2", 2), ("gpb3", 3), ("gpb4", 4)])
+@pytest.mark.parametrize(("merging", "rows"), [("gpb2", 2), *(
+    pytest.param(*case, marks=pytest.mark.thorough) for case in (("gpb3", 3), ("gpb4", 4)))])
 def test_short_records_equal_enumeration(merging, rows):
     """No two histories are merged before the last row."""
     models = {"calm": build(0.3), "rough": build(2.0, 0.3), "far": build(level=2.0)}
@@ -144,6 +145,7 @@ def test_short_records_equal_enumeration(merging, rows):
     np.testing.assert_allclose(switching.log_prob(y), enumerate_paths(switching, y).total, rtol=1e-10)
 
 
+@pytest.mark.thorough
 def test_draws_have_the_smoothing_distribution():
     switching = lfm.Switching({"calm": build(0.3), "rough": build(2.0, 0.3)}, RATES, np.arange(8.0))
     y = np.asarray(switching.sample(jax.random.key(1)))
@@ -169,6 +171,7 @@ NOISELESS = {"room": ({"off": heater(0.0), "on": heater(4.0)}, HEATING, 9),
                               np.array([[0.0, 0.3, 0.1], [0.2, 0.0, 0.2], [0.1, 0.3, 0.0]]), 6)}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", [pytest.param("room", marks=pytest.mark.slow), "room and wall", "three powers"])
 def test_regimes_without_process_noise_have_the_smoothing_distribution(case):
     """A later state pins all earlier ones; rows are missing between."""
@@ -182,6 +185,7 @@ def test_regimes_without_process_noise_have_the_smoothing_distribution(case):
     np.testing.assert_allclose(smoothed.mean, exact.mean, atol=0.06)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("merging", "rows", "present"), [
     ("gpb2", 160, 1), *(pytest.param(*case, marks=pytest.mark.slow)
                         for case in (("imm", 160, 1), ("gpb4", 160, 4), ("gpb2", 1000, 1)))])
@@ -198,6 +202,7 @@ def test_long_records_without_process_noise_have_the_regimes_of_the_truth(mergin
     assert np.sqrt(np.mean((draws[:, :, 0] - w[:, 0]) ** 2)) < (0.2 if present == 1 else 0.6)
 
 
+@pytest.mark.thorough
 def test_nonlinear_regimes_without_process_noise_equal_the_filters_of_all_paths():
     def model(sign):
         return lfm.LatentForceModel(
@@ -213,6 +218,7 @@ def test_nonlinear_regimes_without_process_noise_equal_the_filters_of_all_paths(
     np.testing.assert_allclose(switching.smooth(y).probability[:, 1], weight @ paths, atol=0.05)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("merging", MERGINGS)
 def test_equal_regimes_are_one_model(merging):
     times = np.array([0.0, 0.5, 0.5, 2.0, 3.0])
@@ -230,6 +236,7 @@ def test_equal_regimes_are_one_model(merging):
     np.testing.assert_allclose(scores["residual"], expected.whitened_innovation, atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_requested_times_change_no_probability():
     switching = lfm.Switching({"calm": build(0.3), "rough": build(2.0, 0.3)}, RATES, np.arange(6.0))
     y = np.asarray(switching.sample(jax.random.key(3)))
@@ -259,6 +266,7 @@ PARTICLE_CASES = {"force": lambda: {"calm": build(0.5), "rough": build(2.0)},
                   "decay": lambda: {"slow": build(0.5, decay=0.2, level=4.0), "fast": build(0.5, decay=2.0)}}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", PARTICLE_CASES)
 def test_the_density_is_that_of_particles(case):
     switching = lfm.Switching(PARTICLE_CASES[case](), 0.3 * RATES, np.arange(40.0), merging="gpb4")
@@ -275,7 +283,8 @@ def test_long_series_are_within_a_tenth_of_many_particles(case, merging):
     assert abs(rao_blackwellised(switching, y, 100_000) - float(switching.log_prob(y))) < 0.1
 
 
-@pytest.mark.parametrize("merging", MERGINGS)
+@pytest.mark.parametrize("merging", [
+    MERGINGS[0], *(pytest.param(name, marks=pytest.mark.thorough) for name in MERGINGS[1:])])
 def test_gradients_equal_finite_differences(merging):
     times = np.array([0.0, 0.4, 1.0, 1.0, 2.5, 3.0])
     y = np.array([[0.1], [0.8], [np.nan], [1.4], [-1.0], [0.3]])
@@ -291,6 +300,7 @@ def test_gradients_equal_finite_differences(merging):
     np.testing.assert_allclose(jax.grad(function)(z), differences, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_a_regime_that_cannot_be_reached_has_no_influence():
     times, y = np.arange(4.0), np.array([[0.1], [0.4], [-0.2], [0.3]])
     switching = lfm.Switching({"a": build(), "b": build(5.0)}, np.zeros((2, 2)), times, initial=[1.0, 0.0])
@@ -313,6 +323,7 @@ ZERO_RATES = {
     "a probability": lambda p: (np.array([[0, 0.2, 0.1], [0.3, 0, 0], [0.7, 0.1, 0]]), jnp.stack([1 - p, 0.0 * p, p]))}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("case", "merging"), [
     ("a rate", "gpb2"), ("the only ways to a regime", "gpb2"), ("a probability", "imm"),
     *(pytest.param(*case, marks=pytest.mark.slow)
@@ -351,6 +362,7 @@ def matern_as_states(scale, lengthscale):
         process_noise=np.array([[0.0], [0.0], [2 * scale * rate**1.5]]))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("merging", ["gpb2", pytest.param("imm", marks=pytest.mark.slow)])
 def test_a_change_of_the_lengthscale_keeps_the_derivative_of_a_force(merging):
     parameters = {"long": (1.0, 2.0), "short": (0.7, 0.4)}
@@ -366,6 +378,7 @@ def test_a_change_of_the_lengthscale_keeps_the_derivative_of_a_force(merging):
         np.testing.assert_allclose(smoothed.mean, expected.mean * scale, atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_stiff_regimes_take_exponential_steps():
     def model(rate):
         return lfm.LatentForceModel(
@@ -382,6 +395,7 @@ def test_stiff_regimes_take_exponential_steps():
     assert np.isfinite(exponential.smooth(y, [0.5, 3.5]).mean).all()
 
 
+@pytest.mark.thorough
 def test_impossible_data_have_a_density_of_minus_infinity():
     def model(offset):
         return lfm.LatentForceModel(lambda x, u, t: -x, {}, lfm.GaussianObservation(
@@ -394,6 +408,7 @@ def test_impossible_data_have_a_density_of_minus_infinity():
         switching.log_prob(np.full((3, 1), 7.0))
 
 
+@pytest.mark.thorough
 def test_simulations_have_the_moments_of_the_chain():
     times = np.array([0.0, 0.5, 1.0, 3.0])
     models = {"low": build(0.5, level=-2.0), "high": build(0.5, level=3.0)}
@@ -406,6 +421,7 @@ def test_simulations_have_the_moments_of_the_chain():
     np.testing.assert_allclose(np.var(np.asarray(y - w[:, :, :1])), 0.1, rtol=0.05)
 
 
+@pytest.mark.thorough
 def test_nonlinear_regimes_are_linearised():
     def model(sign):
         return lfm.LatentForceModel(
@@ -419,6 +435,7 @@ def test_nonlinear_regimes_are_linearised():
     np.testing.assert_allclose(switching.log_prob(y), single.log_prob(y), rtol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("requested", [[5.0, 12.0], np.arange(3.5, 12.1, 0.5)])
 def test_forecasts_stay_in_the_range_of_the_regimes(requested):
     """From a regime without noise about its level, the state moves between the levels, and ends at both."""
@@ -433,6 +450,7 @@ def test_forecasts_stay_in_the_range_of_the_regimes(requested):
     np.testing.assert_allclose(w[:, -1, 2].mean(), chain[0, 1], atol=0.06)
 
 
+@pytest.mark.thorough
 def test_known_inputs_of_any_regime_divide_the_intervals():
     """The process noise of the second regime, which holds, has a step between two rows."""
     step = lfm.Input([0.0, 2.5, 10.0], [0.3, 3.0, 3.0], "previous")
@@ -454,6 +472,7 @@ def regimes_model(times, y=None):
     numpyro.sample("y", lfm.Switching({"calm": build(0.3), "rough": build(2.0)}, rates, times), obs=y)
 
 
+@pytest.mark.thorough
 def test_a_fit_has_paths_of_regimes_and_forecasts():
     times = np.arange(0.0, 20.0, 0.5)
     switching = lfm.Switching({"calm": build(0.3), "rough": build(2.0)}, 0.2 * RATES, times)
@@ -520,6 +539,7 @@ def test_malformed_arguments_have_one_line(change, match):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.thorough
 def test_traced_probabilities_and_initial_times_are_checked():
     times, y = np.arange(3.0), np.zeros((3, 1))
     models = {"a": build(), "b": build()}

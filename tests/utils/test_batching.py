@@ -78,6 +78,7 @@ def test_after_an_error_nothing_more_begins():
     assert len(begun) <= 3
 
 
+@pytest.mark.thorough
 def test_an_interruption_between_two_batches_ends_the_others(two_cpus):
     bound, count = lfm.bind(relaxation, np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]])), 70
     kept = {}
@@ -108,6 +109,7 @@ class Recorder:
         pass
 
 
+@pytest.mark.thorough
 def test_draws_are_shared_out_to_the_threads_with_the_same_numbers(two_cpus, monkeypatch):
     bound, count = lfm.bind(relaxation, np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]])), 70
     draws = {"noise": np.linspace(0.5, 0.8, count)}

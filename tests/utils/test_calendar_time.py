@@ -160,6 +160,7 @@ def model(times, y=None, unit=None):
 OPTIONS = {"sampler": "map", "samples": 20, "trajectory_draws": 5, "progress": False}
 
 
+@pytest.mark.thorough
 def test_dates_as_times_are_fitted_as_a_table_of_dates():
     hours = pd.date_range("2026-01-05 06:00", periods=8, freq="h")
     y = np.sin(np.arange(8.0) / 5)[:, None]
@@ -183,6 +184,7 @@ def test_dates_as_times_are_fitted_as_a_table_of_dates():
             call()
 
 
+@pytest.mark.thorough
 def test_dates_are_counted_in_the_unit_that_the_model_names():
     hours, y = pd.date_range("2026-01-05 06:00", periods=8, freq="h"), np.sin(np.arange(8.0) / 5)[:, None]
     plain = lfm.fit(model, np.arange(6.0, 14.0) / 24, y, **OPTIONS)
@@ -196,6 +198,7 @@ def test_dates_are_counted_in_the_unit_that_the_model_names():
         np.testing.assert_allclose(result["trajectories"]["time"], [13 / 24], rtol=1e-15)
 
 
+@pytest.mark.thorough
 def test_held_out_numbers_are_in_the_unit_of_the_result():
     y = np.sin(np.arange(8.0) / 5)[:, None]
     result = lfm.fit(model, Data(np.arange(6.0, 14.0), y, ("x",), {"time": "h"}), **OPTIONS)
@@ -207,6 +210,7 @@ def test_held_out_numbers_are_in_the_unit_of_the_result():
         lfm.score(ahead, Data(pd.date_range("2026-01-05", periods=2), [[0.5], [0.6]], ("x",)))
 
 
+@pytest.mark.thorough
 def test_known_inputs_have_the_unit_of_the_model_or_are_refused():
     data = Data([0.0, 1.0], np.zeros((2, 1)), ("x",), {"time": "d"}, inputs={"heat": ([0.0, 0.5], [1.0, 2.0])})
 
@@ -230,6 +234,7 @@ def two_sites(times, y=None):
         numpyro.sample(name, lfm.MarginalLikelihood(system(rate, units={"time": "h"}), times[name]), obs=y[name])
 
 
+@pytest.mark.thorough
 def test_sites_have_the_unit_of_the_model_and_one_kind_of_clock():
     y = np.zeros((3, 1))
     sites = {"a": Data([0.0, 1.0, 2.0], y, ("x",), {"time": "d"}), "b": ([0.0, 5.0, 9.0], y)}

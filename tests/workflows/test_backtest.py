@@ -51,6 +51,7 @@ def test_forecasts_are_those_of_the_data_up_to_the_origin(linear):
     assert (wins[["rmse", "crps", "log_score"]] <= 3).all(axis=None)
 
 
+@pytest.mark.thorough
 def test_further_origins_compile_nothing_and_outputs_have_the_names_of_the_data(linear):
     """Every fit has the shape of the whole data."""
     data_set = lfm.Data(TIMES, data() + 0.1, ("left", "right"))
@@ -106,6 +107,7 @@ def test_wrong_arguments_are_named(change, name):
         lfm.backtest(motif.model, **{"times": TIMES, "y": data(), "horizon": 1, **change})
 
 
+@pytest.mark.thorough
 def test_an_error_of_a_fit_keeps_its_type_and_names_the_origin(monkeypatch):
     def fail(*arguments, **keywords):
         raise UnicodeDecodeError("ascii", b"\xff", 0, 1, "not a text")  # a type that takes five arguments

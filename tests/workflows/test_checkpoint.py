@@ -20,7 +20,6 @@ import pytest
 import xarray as xr
 
 import lfm_ppl as lfm
-from lfm_ppl.inference.tuning import ANCHOR
 from lfm_ppl.cli import main
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.samplers import SAMPLERS
@@ -110,7 +109,8 @@ def whole():
 
 
 @pytest.mark.parametrize(("sampler", "model"), [
-    ("nuts", relaxation), ("ram", relaxation), pytest.param("nuts", bent, marks=pytest.mark.slow),
+    pytest.param("nuts", relaxation, marks=pytest.mark.thorough), ("ram", relaxation),
+    pytest.param("nuts", bent, marks=pytest.mark.slow),
     pytest.param("ram", bent, marks=pytest.mark.slow),
     pytest.param("pmmh", relaxation, marks=pytest.mark.slow)])
 def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, model, whole, tmp_path, stop_after):
@@ -134,6 +134,7 @@ def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, model, whole, 
     assert "partial" not in arviz_data.summary(expected)
 
 
+@pytest.mark.thorough
 def test_a_stop_after_sampling_costs_no_draw(whole, tmp_path, monkeypatch):
     sampler = "ram"
 
@@ -155,6 +156,7 @@ def test_a_stop_after_sampling_costs_no_draw(whole, tmp_path, monkeypatch):
     assert_same(fit(sampler, checkpoint=tmp_path, resume=True), whole(sampler))
 
 
+@pytest.mark.thorough
 def test_a_run_that_nothing_keeps_gives_what_it_has(whole, monkeypatch):
     monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
     adapt = sampling._BlockLength.adapt
@@ -213,6 +215,7 @@ def test_another_run_is_not_resumed(unfinished, changes, name):
     assert {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.thorough
 def test_a_run_of_other_versions_or_in_use_is_not_resumed(unfinished, monkeypatch):
     first = Checkpoint.resume(unfinished, json.loads((unfinished / "checkpoint" / "run.json").read_text()))
     with pytest.raises(RuntimeError, match="in use"):
@@ -224,6 +227,7 @@ def test_a_run_of_other_versions_or_in_use_is_not_resumed(unfinished, monkeypatc
         fit("ram", checkpoint=unfinished, resume=True)
 
 
+@pytest.mark.thorough
 def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
     expected = whole("ram")
     fit("ram", checkpoint=tmp_path)
@@ -248,6 +252,7 @@ def test_folders_that_cannot_be_used(unfinished, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
+@pytest.mark.thorough
 def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
     def stop(*arguments, **keywords):
         raise KeyboardInterrupt
@@ -261,6 +266,7 @@ def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
 # Accuracy
 
 
+@pytest.mark.thorough
 def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
     result = whole("map")
     monkeypatch.setattr("lfm_ppl.inference.draw_batches._SEQUENTIAL_BATCH", 2)
@@ -291,6 +297,7 @@ def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
 # Progress
 
 
+@pytest.mark.thorough
 def test_where_there_is_no_terminal_lines_say_how_far_it_is(capfd, monkeypatch):
     monkeypatch.setattr("lfm_ppl.utils.progress.EVERY_S", 0.0)
     with warnings.catch_warnings():
@@ -390,6 +397,7 @@ def test_ctrl_c_leaves_a_usable_result_within_ten_seconds(tmp_path):
         assert f"{count} of 1000000 draws" in said
 
 
+@pytest.mark.thorough
 def test_a_finished_run_is_left_alone_by_the_command(tmp_path, monkeypatch):
     (tmp_path / "relaxation.py").write_text(MODEL)
     monkeypatch.chdir(tmp_path)

@@ -389,6 +389,7 @@ def test_panel():
 # Reproducibility and warnings
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_result(y):
     settings = {"sampler": "ram", "chains": 1, "warmup": 5, "samples": 5, "trajectory_draws": 2, "at": FORECAST,
                 "init": init_to_uniform, "fixed": {"decay[b]": 1.2}}
@@ -405,6 +406,7 @@ def test_the_same_seed_gives_the_same_result(y):
     assert (attrs["model"], attrs["thin"]) == ("model", 15)  # five steps for each of three parameters
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("options", [{}, {"initial_covariance": 0.04 * np.eye(1)}])
 def test_a_random_walk_from_the_mode_searches_it_once(monkeypatch, y, options):
     search = Mock(side_effect=fit_starts.mode_of)
@@ -444,6 +446,7 @@ def test_times_are_known_to_everything_after_sampling(y):
     np.testing.assert_allclose(group(result, "one_step_ahead")["log_density"][0, 3].sum(), whole, rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_what_fails_after_sampling_does_not_cost_the_draws(y, monkeypatch):
     def broken(*arguments, **keywords):
         raise TypeError("no such thing")
@@ -542,6 +545,7 @@ def test_a_deterministic_state_is_fitted():
     assert abs(draws.mean() - mean) < 0.4 * sd and 0.7 < draws.std() / sd < 1.4
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("fault, reason", [
     ("factor", "'bound'"), ("function", "row 4"), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
         ("prior", "'level'"), ("gradient", "'rate'"), ("law", "y"), ("factors", "1 sweeps")))])
@@ -553,6 +557,7 @@ def test_the_part_that_fails_is_named_where_there_is_nowhere_to_start(fault, rea
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.thorough
 def test_settings_that_the_model_leaves_open():
     def model(times, y=None, steps=None):
         rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.3))

@@ -84,6 +84,7 @@ def test_one_table_and_one_file_over_all(folder):
             np.testing.assert_array_equal(posterior[name].sel(data_set=one.name), values)
 
 
+@pytest.mark.thorough
 def test_what_is_stored_is_not_fitted_again(folder, monkeypatch):
     out, _, yielded = folder
     fitted, call = [], fit_tasks.FitDataSet.__call__
@@ -95,6 +96,7 @@ def test_what_is_stored_is_not_fitted_again(folder, monkeypatch):
     assert not (out / "failed.csv").exists()
 
 
+@pytest.mark.thorough
 def test_progress_is_shown_unless_it_is_switched_off(folder, monkeypatch, capfd):
     monkeypatch.setattr(fit_tasks, "fit", functools.wraps(lfm.fit)(lambda *arguments, **options: folder[2][0].result))
     lines = []
@@ -109,6 +111,7 @@ def other(times, y=None):
     motif.model(times, y, spread=0.5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("change, message", [
     ({"samples": 30}, "options is"), ({"seed": 1}, "seed is 0 there and 1 now"), ({"model": other}, "model is"),
     ({"data": 1}, "data is")])
@@ -120,6 +123,7 @@ def test_results_of_something_else_are_refused(folder, change, message):
         lfm.fit_many(model, sets, checkpoint=folder[0], **{**OPTIONS, **change}).run()
 
 
+@pytest.mark.thorough
 def test_data_and_arguments_of_one_data_set():
     pairs = [("a", lfm.Data(TIMES, motif.data(0), ("a", "b"), truth={"parameters": {"noise_sd": 0.2}})),
              ("b", data_sets()["plant 1"])]
@@ -199,6 +203,7 @@ def rows(seed):
     return np.column_stack([TIMES, motif.data(seed)])
 
 
+@pytest.mark.thorough
 def test_each_of_many_files_and_one_that_cannot_be_read(line, tmp_path):
     for k in range(2):
         csv(tmp_path / "patients" / f"{k}.csv", rows(k))

@@ -135,6 +135,7 @@ def test_after_the_data_a_nonlinear_model_has_its_own_distribution(between_the_w
         np.testing.assert_array_equal(result["y_mean"], result["outputs"])
 
 
+@pytest.mark.thorough
 def test_one_path_goes_through_the_last_observation():
     """The simulated path starts where the smoothed one ends: neighbouring times stay near each other."""
     settings = {"model_kwargs": {"iterations": 0}, "draws": 200}
@@ -156,6 +157,7 @@ def test_a_far_forecast_alone_is_that_of_many_times(between_the_wells):
     assert distance.statistic < 1.95 / np.sqrt(DRAWS) + 0.01
 
 
+@pytest.mark.thorough
 def test_another_model_and_impossible_times_are_refused(known):
     keywords = {"model_kwargs": {"spread": NEAR}}
     for times, name in (([5.0, 4.0], "entry 1"), ([-1.0], "initial time"), ([], "at least one"), ([np.nan], "finite")):
@@ -222,6 +224,7 @@ def dosed(times, y=None, events=()):
     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
 
+@pytest.mark.thorough
 def test_later_events_follow_those_of_the_fit():
     rate = np.array([[[0.4], [0.6]]])
     observed = xr.Dataset({"y": (("time", "output"), [[1.0], [0.5]])}, {"time": [1.0, 2.0], "output": ["drug"]})
@@ -257,6 +260,7 @@ def rowwise(times, y=None, R=None):
             numpyro.sample("y", lfm.panel(build, {"decay": jnp.repeat(decay, 2), "R": R}, times), obs=y)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("lead", [(), pytest.param((2,), marks=pytest.mark.slow)], ids=["series", "panel"])
 def test_noise_of_rows_is_continued_or_constant(lead):
     times, rng = np.arange(4.0), np.random.default_rng(0)
@@ -289,6 +293,7 @@ def test_noise_of_rows_is_continued_or_constant(lead):
             lfm.forecast(result, rowwise, at, inputs=inputs, model_kwargs={"R": rows}, progress=False)
 
 
+@pytest.mark.thorough
 def test_a_panel_is_forecast_series_by_series():
     def model(times, y=None):
         decay = numpyro.sample("decay", dist.LogNormal(jnp.log(jnp.array([0.5, 1.2])), NEAR).to_event(1))
@@ -364,6 +369,7 @@ def elimination(times, y=None, limit=50.0, start=3000.0, **options):
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, iterations=0, **options), obs=y)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("at", [[72.0], pytest.param([42.0, 57.0, 58.5, 60.0, 61.0, 72.0], marks=pytest.mark.slow)],
                          ids=["sparse", "dense"])
 def test_a_decay_that_is_fast_after_the_data_only(at):

@@ -57,6 +57,7 @@ def test_the_plate_is_a_dimension_of_every_group(result):
     assert ResultView.of(result).group("trajectories")["times"].dims == ("patient", "time")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("series", [0, 1])
 def test_a_selected_series_is_smoothed_as_if_alone(result, series):
     view = lfm.select_series(result, LABELS[series])
@@ -75,6 +76,7 @@ def test_a_selected_series_is_smoothed_as_if_alone(result, series):
     assert ResultView.of(view).posterior["rate"].dims == ("chain", "draw")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("times", [[6.0, 7.0], [[1.5, 7.0], [3.5, 9.0]]])
 def test_a_forecast_is_that_of_each_series(result, times):
     ahead = lfm.forecast(result, model, times, progress=False)
@@ -88,6 +90,7 @@ def test_a_forecast_is_that_of_each_series(result, times):
         np.testing.assert_allclose(predicted["y_sd"][0, 0, :, 0], sd, rtol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("times", [[6.0, 7.0], [1.5, 3.5, 9.0]])
 def test_a_forecast_of_a_selected_series_is_that_of_the_panel(result, times, tmp_path):
     ahead = lfm.forecast(result, model, times, progress=False)
@@ -110,6 +113,7 @@ def test_the_likelihood_of_a_selected_series_is_that_of_the_panel(result):
         rebuilding.problem(lfm.select_series(result, "Bo"), model)
 
 
+@pytest.mark.thorough
 def test_a_nonlinear_forecast_follows_the_dynamics(result):
     """dx/dt = -x^3 without noise: x(t) = (x(0)^-2 + 2 t)^-1/2, between the rows and after them."""
 
@@ -142,6 +146,7 @@ def test_figures_have_axes_for_each_series(result):
         plot_fit(lfm.select_series(result, 0), series=0)
 
 
+@pytest.mark.thorough
 def test_the_report_shows_the_series(result, tmp_path):
     ahead = lfm.forecast(result, model, [[1.5, 7.0], [3.5, 9.0]], progress=False)
     page = lfm.save_report(ahead, tmp_path).read_text()

@@ -72,7 +72,8 @@ def posterior_mean():
     return mean, np.sqrt(weight @ (grid - mean) ** 2)
 
 
-@pytest.mark.parametrize("sampler", ["ram", "nuts"])
+@pytest.mark.thorough
+@pytest.mark.parametrize("sampler", [pytest.param("ram", marks=pytest.mark.thorough), "nuts"])
 def test_samplers_have_the_posterior_of_the_product(sampler):
     result = lfm.fit(both, DATA, sampler=sampler, chains=2, warmup=150, samples=500, trajectory_draws=0,
                      chain_method="vectorized", progress=False)
@@ -87,6 +88,7 @@ def test_a_sampler_of_one_site_says_so():
         lfm.fit(both, DATA, sampler="pmmh", progress=False)
 
 
+@pytest.mark.thorough
 def test_groups_by_site(fitted):
     observed = ResultView.of(fitted).group("observed_data")
     assert observed["a"].dims == ("a_observation",) and observed["b"].dims == ("b_observation",)
@@ -106,6 +108,7 @@ def test_groups_by_site(fitted):
         ResultView.of(fitted).group("trajectories")
 
 
+@pytest.mark.thorough
 def test_a_selected_site_is_a_result_of_one_site(fitted, tmp_path):
     lfm.save(fitted, tmp_path / "fit.nc")
     for result in (fitted, lfm.load(tmp_path / "fit.nc")):
@@ -123,6 +126,7 @@ def test_a_selected_site_is_a_result_of_one_site(fitted, tmp_path):
         lfm.select_series(fitted, "c")
 
 
+@pytest.mark.thorough
 def test_forecast_and_score_by_site(fitted):
     ahead = lfm.forecast(fitted, both, {"a": [6.0, 7.0]}, progress=False)
     assert ResultView.of(ahead).group("predictions_a")["a"].shape == (1, 40, 2, 1)
@@ -133,6 +137,7 @@ def test_forecast_and_score_by_site(fitted):
         lfm.forecast(fitted, both, {"c": [6.0]}, progress=False)
 
 
+@pytest.mark.thorough
 def test_a_forecast_of_a_selected_site_is_that_of_all_sites(fitted, tmp_path):
     for name, times in (("a", [6.0, 7.0]), ("b", [2.2, 5.0])):
         site = lfm.select_series(fitted, name)
@@ -143,6 +148,7 @@ def test_a_forecast_of_a_selected_site_is_that_of_all_sites(fitted, tmp_path):
         assert lfm.score(alone, np.zeros((2, len(GAIN[name])))).loc["all", "n"] == 2 * len(GAIN[name])
 
 
+@pytest.mark.thorough
 def test_paths_of_a_site_are_those_of_its_model_alone():
     times = {"a": np.arange(2.0, 6.0), "b": np.arange(5.0)}
     y = {"a": Y["a"][:4], "b": np.append(np.exp(-0.4 * times["b"][:-1]), np.nan)[:, None]}
@@ -164,6 +170,7 @@ def test_paths_of_a_site_are_those_of_its_model_alone():
         np.testing.assert_allclose(paths[name], expected[name], atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_the_check_adds_the_sites(fitted):
     report = lfm.check_accuracy(fitted, both, draws=10, particles=500, replicates=2, reference="particles",
                                 progress=False)
@@ -174,6 +181,7 @@ def test_the_check_adds_the_sites(fitted):
     assert np.all(np.abs(report.dataset["log_likelihood_reference"].values.ravel() - expected) < 6 * noise + 0.1)
 
 
+@pytest.mark.thorough
 def test_report_and_figures_of_a_site(fitted, tmp_path):
     site = lfm.select_series(fitted, "b")
     names = {path.name for path in save_figures(site, tmp_path)}
@@ -185,6 +193,7 @@ def test_report_and_figures_of_a_site(fitted, tmp_path):
             draw(fitted)
 
 
+@pytest.mark.thorough
 def test_dates_of_all_sites_count_from_one_midnight():
     days = {name: pd.date_range(first, periods=len(Y[name]), freq="D")
             for name, first in (("a", "2026-01-02"), ("b", "2026-01-01"))}
@@ -201,6 +210,7 @@ def heated(times, y, inputs):
         numpyro.sample(name, likelihood(name, rate, times[name], inputs[name].get("heat")), obs=y[name])
 
 
+@pytest.mark.thorough
 def test_known_inputs_reach_their_site():
     heat = (np.array([0.0, 2.0]), np.array([0.5, 0.0]))
     data = {"a": lfm.Data(TIMES["a"], Y["a"], ("level",), inputs={"heat": heat}), "b": DATA["b"]}
@@ -233,6 +243,7 @@ def test_data_by_site_are_told_from_columns():
         lfm.fit(both, {"a": DATA["a"], "b": Y["b"]}, progress=False)
 
 
+@pytest.mark.thorough
 def test_a_finished_fit_is_read_again(fitted, folder):
     again = lfm.fit(both, DATA, checkpoint=folder, resume=True, **SETTINGS)
     np.testing.assert_array_equal(ResultView.of(again).posterior["rate"],
@@ -242,6 +253,7 @@ def test_a_finished_fit_is_read_again(fitted, folder):
         lfm.fit(both, other, checkpoint=folder, resume=True, **SETTINGS)
 
 
+@pytest.mark.thorough
 def test_draws_of_numpyro(fitted):
     draws = {"rate": ResultView.of(fitted).posterior["rate"].values}
     result = lfm.to_arviz(draws, both, TIMES, Y, trajectory_draws=0)
