@@ -14,6 +14,7 @@ from systems import double_well
 import lfm_ppl as lfm
 from lfm_ppl.accuracy.log_likelihoods import gaussian
 from lfm_ppl.inference.laplace_start import laplace_approximation
+from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.inference.tuning import ANCHOR, TOLERATED_ERROR, anchor_at_mode
 from lfm_ppl.results import rebuilding
 from lfm_ppl.results.result_view import ResultView
@@ -51,7 +52,7 @@ def test_a_result_names_its_density_and_gives_it_again(result):
     recorded = result["one_step_ahead"]["log_density"].transpose("chain", "draw", ...).values.sum(axis=-1).ravel()
     np.testing.assert_allclose(gaussian(problem), recorded, rtol=1e-9)
     converged = gaussian(problem, iterations=40)
-    from_filter = gaussian(rebuilding.LikelihoodProblem(lfm.bind(crossing, TIMES, Y), problem.draws))
+    from_filter = gaussian(ModelDraws(lfm.bind(crossing, TIMES, Y), problem.draws))
     assert np.std(recorded - converged) < max(2 * TOLERATED_ERROR, 0.3 * np.std(from_filter - converged))
     mean = lfm.forecast(result, crossing, [4.5], draws=8, progress=False)  # compares log likelihoods
     assert "predictions" in ResultView.of(mean).groups
