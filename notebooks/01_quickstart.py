@@ -76,8 +76,8 @@ def motif(times, y=None):
 # %%
 truth = {"decay": 0.6, "lengthscale": 3.0, "noise_sd": 0.1}
 grid = np.linspace(0.0, 24.0, 241)
-drawn = lfm.simulate(jax.random.key(4), build(**truth), grid)
-times, y = grid[::10], np.array(drawn.y[::10])
+simulation = lfm.simulate(jax.random.key(4), build(**truth), grid)
+times, y = grid[::10], np.array(simulation.y[::10])
 y[[6, 7, 15]] = np.nan
 
 # %% [markdown]
@@ -88,9 +88,9 @@ y[[6, 7, 15]] = np.nan
 # ArviZ object.
 
 # %%
-at = np.linspace(0.0, 27.0, 136)
-known = {"times": grid, "forces": drawn.forces, "state": drawn.state, "parameters": truth}
-result = lfm.fit(motif, times, y, at=at, truth=known, progress=False, **size)
+requested_times = np.linspace(0.0, 27.0, 136)
+simulated_truth = {"times": grid, "forces": simulation.forces, "state": simulation.state, "parameters": truth}
+result = lfm.fit(motif, times, y, at=requested_times, truth=simulated_truth, progress=False, **size)
 print(tables.text_table(summary(result)))
 
 # %% [markdown]
@@ -141,11 +141,11 @@ variants = {
 elsewhere = {**at_mean, "decay": at_mean["decay"] * 1.3}
 print(f"{'':24} at the posterior mean   decay 30% higher   difference")
 for name, settings in variants.items():
-    here, there = (
+    mean_log_prob, shifted_log_prob = (
         float(lfm.MarginalLikelihood(build(**parameters), times, steps=20, **settings).log_prob(y))
         for parameters in (at_mean, elsewhere)
     )
-    print(f"{name:24} {here:21.2f} {there:18.2f} {there - here:12.2f}")
+    print(f"{name:24} {mean_log_prob:21.2f} {shifted_log_prob:18.2f} {shifted_log_prob - mean_log_prob:12.2f}")
 
 # %% [markdown]
 # **Answer.** The decay rate is 0.65, 95% between 0.43 and 1.01. The band of the factor is narrow where there are data,

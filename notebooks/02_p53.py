@@ -126,9 +126,9 @@ print(f"probability that it lies in the first half of the experiment: {early:.3f
 # log 2 / decay. Sensitivities are relative to that of CDKN1A, as published ones are.
 
 # %%
-def genes(one) -> pd.DataFrame:
+def genes(result) -> pd.DataFrame:
     """Return the rates of every gene of a result, in the units of the file."""
-    posterior = one["posterior"]
+    posterior = result["posterior"]
     outputs = [str(gene) for gene in posterior["output"].values]
     anchor = outputs.index("CDKN1A") if "CDKN1A" in outputs else 0
     draws = {name: posterior[name].values.reshape(-1, len(outputs)) for name in ("basal", "sensitivity", "decay")}
@@ -191,9 +191,9 @@ for axes, (name, values) in zip(panels, published.items(), strict=True):
     for shift, (link, colour, shape) in enumerate(zip(results, colours, shapes, strict=True)):
         table = genes(results[link]).filter(like=name, axis=1)
         low, middle, high = table.to_numpy().T
-        at = np.arange(len(table)) + 0.15 * (shift - 1.5)
+        bar_positions = np.arange(len(table)) + 0.15 * (shift - 1.5)
         bars = [middle - low, high - middle]
-        axes.errorbar(at, middle, bars, ls="", marker=shape, ms=3, lw=1, color=colour, label=link)
+        axes.errorbar(bar_positions, middle, bars, ls="", marker=shape, ms=3, lw=1, color=colour, label=link)
     if path.is_file():
         axes.plot(range(len(table)), [values[gene] for gene in table.index], ls="", marker="_", ms=22, color="black",
                   label="published")
@@ -208,8 +208,8 @@ plt.show()
 # %%
 response, gamma = transcription.definitions["activity"], transcription.options["gamma"][0]
 figure, panels = plt.subplots(1, 4, figsize=(7.0, 2.2), layout="constrained")
-for axes, colour, (link, one) in zip(panels, colours, results.items(), strict=True):
-    trajectories = one["trajectories"]
+for axes, colour, (link, link_result) in zip(panels, colours, results.items(), strict=True):
+    trajectories = link_result["trajectories"]
     force = trajectories["forces"].isel(force=0).stack(sample=("chain", "draw"))
     activity = np.asarray(response(jax.numpy.asarray(force.transpose("time", "sample").values), link, gamma))
     low, middle, high = np.quantile(activity, [0.025, 0.5, 0.975], axis=1)

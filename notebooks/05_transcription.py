@@ -117,10 +117,10 @@ scores.readable(computed.tables["paired"])
 #     lfm-ppl compare transcription-parameters
 
 # %%
-chosen = parameters_study.TranscriptionParametersSettings()
+parameter_settings = parameters_study.TranscriptionParametersSettings()
 if quick:
-    chosen = chosen.quick()
-posteriors = parameters_study.STUDY.run(chosen, folder.parent / "transcription-parameters")
+    parameter_settings = parameter_settings.quick()
+posteriors = parameters_study.STUDY.run(parameter_settings, folder.parent / "transcription-parameters")
 scores.readable(posteriors.tables["agreement"])
 
 # %% [markdown]
@@ -129,11 +129,11 @@ scores.readable(posteriors.tables["agreement"])
 # Carlo error in brackets.
 
 # %%
-drawn = parameters_study.draw(chosen, posteriors.data)
-drawn["posteriors-softplus"]
+parameter_figures = parameters_study.draw(parameter_settings, posteriors.data)
+parameter_figures["posteriors-softplus"]
 
 # %%
-drawn.get("posteriors-saturation-0.5")
+parameter_figures.get("posteriors-saturation-0.5")
 
 # %% [markdown]
 # ## What the filter's posterior leaves
@@ -143,8 +143,8 @@ drawn.get("posteriors-saturation-0.5")
 
 # %%
 size = dict(chains=2, warmup=20, samples=20) if quick else dict(chains=2, warmup=500, samples=1500)
-for label in chosen.links:
-    data = problem.data_set(parameters.LINKS[label], 0, chosen.seed)
+for label in parameter_settings.links:
+    data = problem.data_set(parameters.LINKS[label], 0, parameter_settings.seed)
     keywords = {"link": parameters.LINKS[label].link, "gamma": parameters.LINKS[label].gamma}
     result = lfm.fit(parameters.model, problem.TIMES, data.y, model_kwargs=keywords, progress=False, **size)
     print(f"{label}\n")

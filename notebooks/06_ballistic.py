@@ -55,7 +55,7 @@ result = study.STUDY.run(settings, folder)
 # ## One target
 #
 # The smoother at the true parameters. In the upper row the bands are hardly wider than the line; below are the errors,
-# and those of the smoother with the most particles.
+# together with the errors of the smoother with the most particles.
 
 # %%
 figures.plot_paths(result.data, settings.seed)

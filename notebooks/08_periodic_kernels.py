@@ -72,7 +72,7 @@ figures.plot_errors(settings, result.data)
 scores.readable(result.tables["covariance"])
 
 # %% [markdown]
-# `significant` counts eigenvalues above 1/100 of the largest, those of a pair together. That leaves out less than 0.01
+# `significant` counts eigenvalues above 1/100 of the largest, and a pair as one. That leaves out less than 0.01
 # of the variance of smooth kernels, but 0.05 of that of the roughest here.
 #
 # ## A kernel that is not periodic

@@ -79,11 +79,11 @@ def build(heater):
 set_point = lfm.Input([0.0, 6.0, 22.0], [16.0, 20.0, 16.0])
 times = np.arange(0.0, 24.0, 1 / 6)
 day = lfm.rao_blackwellised(jax.random.key(0), build, lfm.Thermostat(set_point), times, particles=1000)
-whole = lfm.simulate_switched(jax.random.key(1), build, lfm.Thermostat(set_point), times, paths=20_000)
+full_paths = lfm.simulate_switched(jax.random.key(1), build, lfm.Thermostat(set_point), times, paths=20_000)
 mean, sd = day.outputs.moments()
 pd.DataFrame({
     "mean": mean[::24, 0], "sd": sd[::24, 0], "Monte Carlo error": day.outputs.error()[::24, 0],
-    "mean of 20,000 whole paths": whole.state[::24, :, 0].mean(axis=1), "heater on": day.input_mean[::24],
+    "mean of 20,000 whole paths": full_paths.state[::24, :, 0].mean(axis=1), "heater on": day.input_mean[::24],
 }, index=pd.Index(times[::24], name="hour")).round(3)
 
 # %% [markdown]
@@ -96,8 +96,8 @@ folder = problem.data_folder()
 print("real house and simulated homes" if folder else f"no {problem.FILE}: simulated homes only")
 make = study.HomeHeatingSettings.quick if quick else study.HomeHeatingSettings
 settings = make(data=None if folder is None else str(folder))
-kept = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/home-heating"))
-result = study.STUDY.run(settings, kept)
+results_folder = Path(os.environ.get("LFM_COMPARE", "lfm-results/compare/home-heating"))
+result = study.STUDY.run(settings, results_folder)
 
 # %% [markdown]
 # ## The real house

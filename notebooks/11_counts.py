@@ -62,8 +62,8 @@ def build(observation):
 
 times = np.arange(40.0)
 counted = build(lfm.PoissonObservation(lambda x, u, t: 1.5 + u))
-drawn = lfm.simulate(jax.random.key(2), counted, times)
-y = np.where((times < 15)[:, None] | (times > 21)[:, None], drawn.y, np.nan)
+simulation = lfm.simulate(jax.random.key(2), counted, times)
+y = np.where((times < 15)[:, None] | (times > 21)[:, None], simulation.y, np.nan)
 likelihood = lfm.MarginalLikelihood(counted, times)
 print(f"log Z by EP: {float(likelihood.log_prob(y)):.4f}")
 
@@ -104,7 +104,7 @@ scores.readable(result.tables["accuracy"])
 # not the same for skew posteriors, and its log Z is the furthest off for yes or no and for gross errors.
 #
 # A run of the reference with 160,000 draws, accurate to 0.005, gives the largest errors of EP: standard deviations of
-# Student's t are within 0.021 of the exact ones, those of yes or no within 0.040; means within 0.017 and 0.009 of one.
+# Student's t are within 0.021 of the exact ones, of yes or no within 0.040; means within 0.017 and 0.009 of one.
 
 # %%
 figures.plot_errors(settings, result.data)
@@ -122,7 +122,7 @@ scores.readable(result.tables["prediction"])
 # %% [markdown]
 # ## The parameters, and the reference itself
 #
-# `ess` and `r_hat` are those of the elliptical slices, the worst of 40 entries of the predictor; `share` is the
+# `ess` and `r_hat` describe the elliptical slices: the worst of 40 entries of the predictor; `share` is the
 # effective share of the draws of importance sampling.
 
 # %%

@@ -139,7 +139,7 @@ quick or scores.readable(result.tables["shapes"]).T
 # %% [markdown]
 # ## A target on reentry
 #
-# The source's target: it is at 65 km and falls at 3 km/s, and the estimator is told 55 km and 2 km/s, with next to no
+# The source's target: it is at 65 km and falls at 3 km/s, and the estimator starts at 55 km and 2 km/s, with next to no
 # weight. Only distances are measured; dynamics and measurement are not linear.
 
 # %%

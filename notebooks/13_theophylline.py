@@ -107,9 +107,9 @@ def model(times, y=None, doses=None):
     population = {name: (numpyro.sample(f"{name}_mean", dist.Normal(mean, sd)),
                          numpyro.sample(f"{name}_sd", dist.HalfNormal(0.5))) for name, (mean, sd) in MEANS.items()}
     with numpyro.plate("subject", len(subjects)):
-        own = {name: numpyro.sample(name, dist.LogNormal(mean, sd)) for name, (mean, sd) in population.items()}
+        individual = {name: numpyro.sample(name, dist.LogNormal(mean, sd)) for name, (mean, sd) in population.items()}
         shared = {"scale": scale, "noise_sd": noise_sd}
-        parameters = own | {name: jnp.broadcast_to(value, (len(subjects),)) for name, value in shared.items()}
+        parameters = individual | {name: jnp.broadcast_to(value, (len(subjects),)) for name, value in shared.items()}
         numpyro.sample("y", lfm.panel(build, parameters | {"dose": doses}, times), obs=y)
 
 
@@ -154,8 +154,8 @@ for axis, name in zip(axes, MEANS, strict=True):
     low, high = np.quantile(posterior[name].to_numpy().reshape(-1, len(subjects)), [0.025, 0.975], axis=0)
     axis.errorbar(alone[name], pooled[name], [pooled[name] - low, high - pooled[name]], fmt="o", ms=3, lw=0.8,
                   color="#0072B2")
-    ends = [min(alone[name].min(), low.min()), max(alone[name].max(), high.max())]
-    axis.plot(ends, ends, color="0.5", lw=0.8, ls="--")
+    limits = [min(alone[name].min(), low.min()), max(alone[name].max(), high.max())]
+    axis.plot(limits, limits, color="0.5", lw=0.8, ls="--")
     axis.set(xlabel=f"{labels[name]}\nleast squares, alone", ylabel="posterior median, 95%" if axis is axes[0] else "")
 
 # %%

@@ -76,7 +76,7 @@ y = temperature + NOISE_SD * np.random.default_rng(0).normal(size=temperature.sh
 
 # %%
 BASIS = lfm.LaplaceBasis((0.0, 1.0), 10, "neumann")
-UNITS = {"time": "min"} | {f"r={place:.2f}": "K" for place in sensors}
+UNITS = {"time": "min"} | {f"r={position:.2f}": "K" for position in sensors}
 
 
 def heat_source(p):
@@ -112,14 +112,14 @@ lfm.plot_field(result, heat_source, sensors=sensors, name="source", unit="K/min"
 # The flame itself, and the estimate of it: `lfm.evaluate_field` returns draws, mean and standard deviation as xarray.
 
 # %%
-places = np.linspace(0.0, 1.0, 81)
-estimate = lfm.evaluate_field(result, heat_source, places)
+positions = np.linspace(0.0, 1.0, 81)
+estimate = lfm.evaluate_field(result, heat_source, positions)
 figure, axes = plt.subplots(1, 3, figsize=(7, 2.4), sharey=True, layout="constrained")
 for axis, k in zip(axes, (8, 20, 32), strict=True):
     mean, sd = (estimate[name].sel(time=times[k], method="nearest").values for name in ("mean", "sd"))
-    axis.fill_between(places, mean - 1.96 * sd, mean + 1.96 * sd, color="#8FBFDE", lw=0, label="95%")
-    axis.plot(places, mean, color="#0072B2", label="posterior mean")
-    axis.plot(places, flame(places, times[k]), color="black", ls="--", lw=0.9, label="flame")
+    axis.fill_between(positions, mean - 1.96 * sd, mean + 1.96 * sd, color="#8FBFDE", lw=0, label="95%")
+    axis.plot(positions, mean, color="#0072B2", label="posterior mean")
+    axis.plot(positions, flame(positions, times[k]), color="black", ls="--", lw=0.9, label="flame")
     axis.set(xlabel="place (m)", ylabel="source (K/min)" if k == 8 else "", title=f"t = {times[k]:g} min")
 _ = axes[0].legend(frameon=False, fontsize=7)
 
@@ -187,8 +187,8 @@ estimate = lfm.evaluate_field(intensity, rate_field, cells)
 mean, sd = (estimate[name].sel(time=periods, method="nearest").values for name in ("mean", "sd"))
 figure, axis = plt.subplots(figsize=(3.4, 2.8), layout="constrained")
 axis.errorbar(log_rate.ravel(), mean.ravel(), 1.96 * sd.ravel(), fmt="o", ms=2, lw=0.4, color="#0072B2")
-ends = [log_rate.min(), log_rate.max()]
-axis.plot(ends, ends, color="black", ls="--", lw=0.9)
+limits = [log_rate.min(), log_rate.max()]
+axis.plot(limits, limits, color="black", ls="--", lw=0.9)
 axis.set(xlabel="true field, log rate less its level", ylabel="posterior mean, 95%")
 print(f"{100 * np.mean(np.abs(log_rate - mean) < 1.96 * sd):.0f}% of the true values lie in their 95% intervals")
 

@@ -188,15 +188,15 @@ durations.quantile([0.025, 0.5, 0.975]).round(2).rename_axis("mean duration (kyr
 # %%
 KNOWN = {"GI-1": 14.69, "GI-3": 27.78, "GI-4": 28.90, "GI-8": 38.22, "GI-12": 46.86, "GI-14": 54.22}  # kyr b2k
 states = result["trajectories"]["states"].sel(state="warm")
-at, probability = states["time"].to_numpy(), states.mean(("chain", "draw")).to_numpy()
+state_times, probability = states["time"].to_numpy(), states.mean(("chain", "draw")).to_numpy()
 is_onset = (probability[1:] >= 0.5) & (probability[:-1] < 0.5)
-onsets = 0.05 - 0.5 * (at[1:] + at[:-1])[is_onset]
+onsets = 0.05 - 0.5 * (state_times[1:] + state_times[:-1])[is_onset]
 print(f"{len(onsets)} onsets, at {', '.join(f'{age:.2f}' for age in onsets)} kyr b2k")
 
 figure, (top, bottom) = plt.subplots(2, 1, figsize=(7, 3.4), sharex=True, layout="constrained")
 top.plot(ages, isotopes, color="k", lw=0.6)
 top.set(ylabel="d18O (permille)")
-bottom.plot(at, probability, color="#D55E00", lw=0.9)
+bottom.plot(state_times, probability, color="#D55E00", lw=0.9)
 bottom.set(xlabel="time (kyr)", ylabel="probability of warm", ylim=(0, 1.02))
 for name, age in KNOWN.items():
     for axis in (top, bottom):

@@ -81,10 +81,10 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="write nothing")
     parser.add_argument("--jobs", type=int, default=1, help="how many at a time; default: 1")
     arguments = parser.parse_args()
-    wanted = [path for path in sources() if not arguments.names or path.stem in arguments.names]
-    if not wanted:
-        known = ", ".join(path.stem for path in sources())
-        print(f"no notebook {' '.join(arguments.names)}; there are: {known}", file=sys.stderr)
+    selection = [path for path in sources() if not arguments.names or path.stem in arguments.names]
+    if not selection:
+        stems = ", ".join(path.stem for path in sources())
+        print(f"no notebook {' '.join(arguments.names)}; there are: {stems}", file=sys.stderr)
         return 2
     if not arguments.check and quick():
         print("LFM_QUICK is for --check: quick results are not to be kept", file=sys.stderr)
@@ -107,10 +107,10 @@ def main() -> int:
 
     # Each notebook computes in a kernel, which is a process of its own; here a thread waits for it.
     with ThreadPoolExecutor(arguments.jobs) as pool:
-        waiting = [pool.submit(run, source) for source in wanted]
+        waiting = [pool.submit(run, source) for source in selection]
         try:
-            for one in waiting:
-                one.result()
+            for future in waiting:
+                future.result()
         finally:
             pool.shutdown(cancel_futures=True)
     return 0

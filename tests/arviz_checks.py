@@ -32,11 +32,11 @@ def check_arviz(result, counts):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of few draws
         for name, count in counts.items():
-            chosen = {"var_name": name} if len(counts) > 1 else {}
-            loo = az.loo(result, pointwise=True, **chosen)
+            selection = {"var_name": name} if len(counts) > 1 else {}
+            loo = az.loo(result, pointwise=True, **selection)
             pointwise[name] = np.asarray(loo.elpd_i if IS_DATATREE else loo.loo_i)
             assert loo.n_data_points == count and np.isfinite(pointwise[name]).all()
-            assert len(az.compare({"a": result, "b": result}, **chosen)) == 2
+            assert len(az.compare({"a": result, "b": result}, **selection)) == 2
         pits = az.loo_pit(result) if IS_DATATREE else {name: az.loo_pit(result, y=name) for name in counts}
         for name, count in counts.items():
             pit = np.asarray(pits[name])

@@ -18,13 +18,13 @@ def compilations():
                 names.append(record.getMessage()[:120])
 
     logger, handler = logging.getLogger("jax"), Handler()
-    propagate, before = logger.propagate, jax.config.jax_log_compiles
+    propagate, previous_setting = logger.propagate, jax.config.jax_log_compiles
     logger.addHandler(handler)
     logger.propagate = False
     jax.config.update("jax_log_compiles", True)
     try:
         yield names
     finally:
-        jax.config.update("jax_log_compiles", before)
+        jax.config.update("jax_log_compiles", previous_setting)
         logger.removeHandler(handler)
         logger.propagate = propagate

@@ -140,7 +140,10 @@ def structure(seed: int) -> Structure:
     names = np.random.default_rng(3).permutation(list(FORCES))
     forces = [names[seed % len(names)], *generator.choice(names, count - 1)]
     linear = generator.random() < 0.45
-    any_of = lambda choices: str(generator.choice(list(choices)))  # noqa: E731
+
+    def any_of(choices):
+        return str(generator.choice(list(choices)))
+
     return Structure(
         seed, states=int(generator.integers(1, 5)), outputs=int(generator.integers(1, 3)),
         term=any_of(["none", "forcing"] if linear else TERMS),
@@ -150,9 +153,9 @@ def structure(seed: int) -> Structure:
         steps=int(generator.integers(2, 5)))
 
 
-def series(one: Structure, generator: np.random.Generator) -> Series:
+def series(spec: Structure, generator: np.random.Generator) -> Series:
     """Draw numbers over several orders of magnitude, and times with replicates and, now and then, a long gap."""
-    states, forces, outputs = one.states, len(one.forces), one.outputs
+    states, forces, outputs = spec.states, len(spec.forces), spec.outputs
     parameters = {
         "system": 0.5 * generator.normal(size=(states, states)) - generator.uniform(0.3, 1.5) * np.eye(states),
         "coupling": generator.normal(size=(states, forces)),
@@ -178,22 +181,22 @@ def series(one: Structure, generator: np.random.Generator) -> Series:
     return Series(parameters, times, y)
 
 
-def batch(one: Structure, count: int) -> Series:
+def batch(spec: Structure, count: int) -> Series:
     """Draw ``count`` series side by side; times are shared where forces jump, which need them known."""
-    generator = np.random.default_rng(77 + one.seed)
-    drawn = [series(one, generator) for _ in range(count)]
-    if one.jumps:
-        drawn = [single._replace(times=drawn[0].times) for single in drawn]
-    return jax.tree_util.tree_map(lambda *leaves: np.stack(leaves), *drawn)
+    generator = np.random.default_rng(77 + spec.seed)
+    members = [series(spec, generator) for _ in range(count)]
+    if spec.jumps:
+        members = [single._replace(times=members[0].times) for single in members]
+    return jax.tree_util.tree_map(lambda *leaves: np.stack(leaves), *members)
 
 
-def build(one: Structure, parameters: dict[str, Any]) -> lfm.LatentForceModel:
+def build(spec: Structure, parameters: dict[str, Any]) -> lfm.LatentForceModel:
     """Return the model; its parameters may be traced."""
     p = {name: jnp.asarray(value) for name, value in parameters.items()}
     forces = {f"{index} {name}": FORCES[name](p["scale"][index], p["length"][index], p["rate"][index])
-              for index, name in enumerate(one.forces)}
+              for index, name in enumerate(spec.forces)}
     return lfm.LatentForceModel(
-        Dynamics(p["system"], p["coupling"], p["strength"], one.term, one.links), forces,
-        lfm.GaussianObservation(Observed(p["matrix"], one.output), p["noise"]),
+        Dynamics(p["system"], p["coupling"], p["strength"], spec.term, spec.links), forces,
+        lfm.GaussianObservation(Observed(p["matrix"], spec.output), p["noise"]),
         lfm.Gaussian(p["mean"], jnp.diag(p["variance"])),
-        process_noise=jnp.diag(p["dispersion"]) if one.process_noise else None, initial_time=0.0)
+        process_noise=jnp.diag(p["dispersion"]) if spec.process_noise else None, initial_time=0.0)

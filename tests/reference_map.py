@@ -66,19 +66,19 @@ class Transcribed:
         self.rate_of = casadi.Function("f", [state], [rate])
 
     def rate(self, state):
-        own = casadi.vertcat(*self.drift(state, state[self.size]))
-        return casadi.vertcat(own, casadi.mtimes(self.feedback, state[self.size:]))
+        state_rate = casadi.vertcat(*self.drift(state, state[self.size]))
+        return casadi.vertcat(state_rate, casadi.mtimes(self.feedback, state[self.size:]))
 
     def flow(self, length):
         state, step = casadi.SX.sym("s", self.total), length / self.substeps
-        now = state
+        current_state = state
         for _ in range(self.substeps):
-            k1 = self.rate(now)
-            k2 = self.rate(now + step / 2 * k1)
-            k3 = self.rate(now + step / 2 * k2)
-            k4 = self.rate(now + step * k3)
-            now = now + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return casadi.Function("F", [state], [now])
+            k1 = self.rate(current_state)
+            k2 = self.rate(current_state + step / 2 * k1)
+            k3 = self.rate(current_state + step / 2 * k2)
+            k4 = self.rate(current_state + step * k3)
+            current_state = current_state + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return casadi.Function("F", [state], [current_state])
 
     def process_cov(self, state, length):
         """Covariance gained over an interval, by the moment equations along the path from ``state``."""

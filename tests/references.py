@@ -82,8 +82,8 @@ class LinearLFM:
         size, count = self.coupling.shape[0], len(self.kernels)
         means = self.means or [zero] * count
         edges = self._panels(times)
-        left, width = edges[:-1], np.diff(edges)
-        nodes = (left[:, None] + width[:, None] * 0.5 * (NODES + 1)).ravel()
+        left_edges, width = edges[:-1], np.diff(edges)
+        nodes = (left_edges[:, None] + width[:, None] * 0.5 * (NODES + 1)).ravel()
         weights = (width[:, None] * 0.5 * WEIGHTS).ravel()
         kind = np.result_type(self.system, self.coupling, np.asarray(self.covariance),
                               *(k(0.0, 1.0) for k in self.kernels))
@@ -109,21 +109,21 @@ class LinearLFM:
             cross = np.einsum("n,kni,nq->kqi", weights, g, kernel(nodes[:, None], times))
             cov[:, :, :size, size + r] = cross
             cov[:, :, size + r, :size] = cross.swapaxes(0, 1)
-            inner = self._inner(r, times, nodes, weights, g, left, width)  # (N, K, M)
+            inner = self._inner(r, times, nodes, weights, g, left_edges, width)  # (N, K, M)
             cov[:, :, :size, :size] += np.einsum("n,kni,nqj->kqij", weights, g, inner)
         return mean, cov
 
-    def _inner(self, r, times, nodes, weights, g, left, width):
+    def _inner(self, r, times, nodes, weights, g, left_edges, width):
         """int k(a, b) h(t - b) db at the nodes a: the panel that holds a is cut at the kink b = a."""
-        own = np.repeat(np.arange(len(left)), len(NODES))
-        matrix = self.kernels[r](nodes[:, None], nodes) * weights * (own[:, None] != own)
+        panel_index = np.repeat(np.arange(len(left_edges)), len(NODES))
+        matrix = self.kernels[r](nodes[:, None], nodes) * weights * (panel_index[:, None] != panel_index)
         inner = np.einsum("an,kni->aki", matrix, g)
-        for low, high in ((left[own], nodes), (nodes, left[own] + width[own])):
-            inside = low[:, None] + (high - low)[:, None] * 0.5 * (NODES + 1)
-            mass = (high - low)[:, None] * 0.5 * WEIGHTS * self.kernels[r](nodes[:, None], inside)
+        for low, high in ((left_edges[panel_index], nodes), (nodes, left_edges[panel_index] + width[panel_index])):
+            inner_nodes = low[:, None] + (high - low)[:, None] * 0.5 * (NODES + 1)
+            mass = (high - low)[:, None] * 0.5 * WEIGHTS * self.kernels[r](nodes[:, None], inner_nodes)
             # The whole panel lies before t or after it.
-            last = left[own] + width[own]
-            at_last = np.einsum("an,ani->ai", mass, self._response(last[:, None] - inside) @ self.coupling[:, r])
+            last = left_edges[panel_index] + width[panel_index]
+            at_last = np.einsum("an,ani->ai", mass, self._response(last[:, None] - inner_nodes) @ self.coupling[:, r])
             inner = inner + np.einsum("akij,aj->aki", self._response(times - last[:, None]), at_last)
         return inner
 
@@ -139,10 +139,10 @@ class Regression:
     output: np.ndarray
     noise: np.ndarray
 
-    def joint(self, times, y, at=()):
+    def joint(self, times, y, requested_times=()):
         y = np.asarray(y)
         self.count = len(times)
-        mean, cov = self.process.moments(np.concatenate([times, np.asarray(at, float)]))
+        mean, cov = self.process.moments(np.concatenate([times, np.asarray(requested_times, float)]))
         self.mean, self.cov = mean, cov
         present = np.isfinite(y).ravel()
         n = self.count
@@ -156,9 +156,9 @@ class Regression:
         present, residual, k, _ = self.joint(times, y)
         return _log_normal(residual[present], k[np.ix_(present, present)])
 
-    def posterior(self, times, y, at):
-        """Return mean (K, W) and covariance (K, K, W, W) of w at the times ``at``."""
-        present, residual, k, cross = self.joint(times, y, at)
+    def posterior(self, times, y, requested_times):
+        """Return mean (K, W) and covariance (K, K, W, W) of w at ``requested_times``."""
+        present, residual, k, cross = self.joint(times, y, requested_times)
         k, cross, n = k[np.ix_(present, present)], cross[:, :, present], self.count
         cross = cross[n:]
         gain = np.linalg.solve(k, cross.reshape(-1, k.shape[0]).T).T.reshape(cross.shape)
@@ -183,10 +183,10 @@ class Regression:
         row = np.repeat(np.arange(len(times)), np.shape(y)[1])
         values = []
         for index in range(len(times)):
-            this, rest = present & (row == index), present & (row != index)
-            gain = np.linalg.solve(k[np.ix_(rest, rest)], k[np.ix_(rest, this)]).T
-            values.append(_log_normal(residual[this] - gain @ residual[rest],
-                                      k[np.ix_(this, this)] - gain @ k[np.ix_(rest, this)]))
+            row_mask, other_mask = present & (row == index), present & (row != index)
+            gain = np.linalg.solve(k[np.ix_(other_mask, other_mask)], k[np.ix_(other_mask, row_mask)]).T
+            values.append(_log_normal(residual[row_mask] - gain @ residual[other_mask],
+                                      k[np.ix_(row_mask, row_mask)] - gain @ k[np.ix_(other_mask, row_mask)]))
         return np.array(values)
 
 
@@ -260,8 +260,8 @@ def moments(drift: Callable, diffusion: Callable, points: Points | None, mean, c
             jacobian: Callable | None = None, average_jacobian: bool = False):
     """Integrate dm/dt = E f, dP/dt = Cov(f, x) + Cov(x, f) + E D by DOP853 and return (m, P) at span[1].
 
-    ``drift(x, t)`` and ``diffusion(x, t)`` (D = G G') take one point; without points the moments are
-    those of the Taylor expansion at the mean, with ``jacobian(x, t)``. ``average_jacobian`` takes
+    ``drift(x, t)`` and ``diffusion(x, t)`` (D = G G') take one point; without points the moments
+    come from the Taylor expansion at the mean, with ``jacobian(x, t)``. ``average_jacobian`` takes
     Cov(f, x) = E[f'] P, by Stein's lemma.
     """
     n = len(mean)

@@ -171,8 +171,8 @@ def drawn_texts(figure):
             slack = 1e-9 * (high - low)
             texts += [
                 label
-                for place, label in zip(axis.get_ticklocs(), axis.get_ticklabels(), strict=False)
-                if low - slack <= place <= high + slack
+                for location, label in zip(axis.get_ticklocs(), axis.get_ticklabels(), strict=False)
+                if low - slack <= location <= high + slack
             ]
     return [
         (text.get_text(), text.get_fontsize(), text.get_window_extent())
@@ -183,19 +183,19 @@ def drawn_texts(figure):
 
 def assert_readable(figure):
     """No text below 7 pt, none cut off by the figure's edge, none on top of another."""
-    shown = drawn_texts(figure)
-    assert shown
+    texts = drawn_texts(figure)
+    assert texts
     width, height = figure.bbox.width, figure.bbox.height
-    for text, size, box in shown:
+    for text, size, box in texts:
         assert size >= 7.0, (text, size)
         assert -1 <= box.x0 and box.x1 <= width + 1, (text, "beyond the sides", box)
         assert -1 <= box.y0 and box.y1 <= height + 1, (text, "beyond top or bottom", box)
-    for number, (text, _, box) in enumerate(shown):
-        for other, _, box_of_other in shown[number + 1 :]:
+    for number, (text, _, box) in enumerate(texts):
+        for other_text, _, box_of_other in texts[number + 1 :]:
             across = min(box.x1, box_of_other.x1) - max(box.x0, box_of_other.x0)
             down = min(box.y1, box_of_other.y1) - max(box.y0, box_of_other.y0)
             # Boxes hold room for accents and descenders that is rarely used.
-            assert across < 1 or down < 3, (text, other, "overlap", across, down)
+            assert across < 1 or down < 3, (text, other_text, "overlap", across, down)
 
 
 @pytest.fixture
@@ -208,8 +208,8 @@ def crowded():
     """Many outputs and parameters with long names, extreme sizes, many draws and times."""
     rng = np.random.default_rng(0)
     names = [f"sensor_{k}_temperature" for k in range(15)]
-    time, at = np.linspace(0.0, 5e4, 300), np.linspace(0.0, 5e4, 40)
-    wave = [1e-4 * np.sin(t[:, None] / 6e3 + np.arange(15)) for t in (time, at)]
+    time, requested_times = np.linspace(0.0, 5e4, 300), np.linspace(0.0, 5e4, 40)
+    wave = [1e-4 * np.sin(t[:, None] / 6e3 + np.arange(15)) for t in (time, requested_times)]
     y = wave[0] + 2e-5 * rng.normal(size=wave[0].shape)
     y[rng.random(y.shape) < 0.1] = np.nan
     sample = ("chain", "draw")
@@ -231,7 +231,7 @@ def crowded():
             "data": xr.Dataset({"y": (("time", "output"), y, units)}, coords=over),
             "trajectories": xr.Dataset(
                 {"outputs": ((*sample, "time", "output"), wave[1] + 1e-5 * rng.normal(size=(4, 25, 1, 15)))},
-                coords={"time": at, "output": names},
+                coords={"time": requested_times, "output": names},
             ),
             "one_step_ahead": xr.Dataset({"residual": ((*sample, "time", "output"), noisy)}, coords=over),
         }

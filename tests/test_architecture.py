@@ -139,8 +139,8 @@ print(json.dumps([alone, parts, others, changed]))
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300)
     assert run.returncode == 0, run.stderr
-    alone, parts, others, changed = json.loads(run.stdout)
-    assert alone == others == changed == []
+    alone, parts, plotting, changed = json.loads(run.stdout)
+    assert alone == plotting == changed == []
     assert "lfm_ppl.filtering" in parts and not {
         f"lfm_ppl.{name}" for name in ("orbits", "particles", "results", "studies", "cli")} & set(parts)
     assert [name for name in lfm_ppl.__all__ if not hasattr(lfm_ppl, name)] == []

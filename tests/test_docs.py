@@ -97,8 +97,8 @@ def test_examples_of_the_page_on_forecasts_print_its_tables(name, file, output):
     run = subprocess.run([sys.executable, DOCS / "examples" / f"{name}.py", DATA / file], cwd=ROOT,
                          capture_output=True, text=True, check=True)
     page = (DOCS / "forecasts.md").read_text("utf-8")
-    (shown,) = [block for block in re.findall(r"```text\n(.*?)```", page, re.DOTALL) if f" {output} " in block]
-    result, expected = numbers(run.stdout), numbers(shown)
+    (page_table,) = [block for block in re.findall(r"```text\n(.*?)```", page, re.DOTALL) if f" {output} " in block]
+    result, expected = numbers(run.stdout), numbers(page_table)
     assert result.keys() == expected.keys() and len(result) == 4
     for label, row in expected.items():
         assert result[label] == pytest.approx(row, abs=0.02), label

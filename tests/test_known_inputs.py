@@ -43,9 +43,9 @@ def test_blank_cells_are_joined_held_or_zero(tmp_path):
     path = tmp_path / "table.csv"
     path.write_text(HOUSE)
     with pytest.warns(UserWarning, match="'outside'"):
-        known = lfm.read_csv(path, ["indoor"], inputs={"heater": "zero", "outside": "linear"}).known_inputs()
-    assert [float(known["heater"](t)) for t in (360.0, 375.0, 390.0, 479.0, 480.0)] == [0, 0, 2, 2, 0]
-    assert [float(known["outside"](t)) for t in (360.0, 390.0, 450.0)] == [5.0, 4.5, 5.0]
+        inputs = lfm.read_csv(path, ["indoor"], inputs={"heater": "zero", "outside": "linear"}).known_inputs()
+    assert [float(inputs["heater"](t)) for t in (360.0, 375.0, 390.0, 479.0, 480.0)] == [0, 0, 2, 2, 0]
+    assert [float(inputs["outside"](t)) for t in (360.0, 390.0, 450.0)] == [5.0, 4.5, 5.0]
 
     def rates(inputs):
         rate = lfm.read_csv(path, ["conc"], inputs=inputs).known_inputs()["dose_rate"]
@@ -117,9 +117,9 @@ def test_what_is_written_is_read_back(tmp_path):
     data = lfm.Data(times, np.array([[1.0], [np.nan], [2.0]]), ("x",), units={"time": "h"},
                     inputs={"u": (times, np.array([3.0, 4.0, 5.0]))})
     write_csv(data, tmp_path / "written.csv")
-    again = lfm.read_csv(tmp_path / "written.csv", inputs=["u"])
-    np.testing.assert_array_equal(again.y, data.y)
-    np.testing.assert_array_equal(again.inputs["u"].values, data.inputs["u"].values)
+    loaded = lfm.read_csv(tmp_path / "written.csv", inputs=["u"])
+    np.testing.assert_array_equal(loaded.y, data.y)
+    np.testing.assert_array_equal(loaded.inputs["u"].values, data.inputs["u"].values)
 
 
 def heated(times, y=None, inputs=None):
@@ -136,17 +136,17 @@ def test_a_fit_takes_a_table_and_its_result_remembers_inputs_and_dates(tmp_path)
     frame = pd.DataFrame({"room": 18.0 + np.arange(6.0), "outside": np.linspace(5.0, 7.0, 6)}, index=hours)
     data = lfm.read_table(frame, inputs={"outside": "linear"})
     result = lfm.fit(heated, data, sampler="map", samples=10, trajectory_draws=5, progress=False)
-    again = arviz_data.load(arviz_data.save(result, tmp_path / "posterior.nc"))
-    np.testing.assert_array_equal(ResultView.of(again).inputs["outside"].values, data.inputs["outside"].values)
-    assert ResultView.of(again).inputs["outside"].interpolation == "linear"
-    assert ResultView.of(again).attrs["time_origin"] == "2026-01-05T00:00:00"
-    assert ResultView.of(again).group("data")["time"].attrs["units"] == "h"
+    loaded = arviz_data.load(arviz_data.save(result, tmp_path / "posterior.nc"))
+    np.testing.assert_array_equal(ResultView.of(loaded).inputs["outside"].values, data.inputs["outside"].values)
+    assert ResultView.of(loaded).inputs["outside"].interpolation == "linear"
+    assert ResultView.of(loaded).attrs["time_origin"] == "2026-01-05T00:00:00"
+    assert ResultView.of(loaded).group("data")["time"].attrs["units"] == "h"
     # The model is bound again with the inputs that the result holds, and gives the densities that it records.
-    whole = rebuilding.problem(again, heated)
-    assert np.isfinite(whole.bound.log_density(np.zeros(whole.bound.size)))
-    assert "Jan 2026" in plot_fit(again).axes[0].get_xlabel()
+    rebuilt = rebuilding.problem(loaded, heated)
+    assert np.isfinite(rebuilt.bound.log_density(np.zeros(rebuilt.bound.size)))
+    assert "Jan 2026" in plot_fit(loaded).axes[0].get_xlabel()
     # A forecast remembers the inputs that it goes on with, and a warning names times as the data do.
     longer = lfm.Input(np.arange(12.0), 5.0 + 0.4 * np.arange(12.0), "linear")
     with pytest.warns(UserWarning, match="2026-01-05T13:00"):
-        ahead = lfm.forecast(again, heated, [8.0, 13.0], inputs={"outside": longer}, progress=False)
-    np.testing.assert_array_equal(ResultView.of(ahead).forecast_inputs["outside"].values, longer.values)
+        forecast = lfm.forecast(loaded, heated, [8.0, 13.0], inputs={"outside": longer}, progress=False)
+    np.testing.assert_array_equal(ResultView.of(forecast).forecast_inputs["outside"].values, longer.values)

@@ -170,16 +170,16 @@ def put(folder, files):
 def test_command_lines(case, folder, capsys):
     line, files, *parts = case
     put(folder, files)
-    before = contents(folder)
+    initial_contents = contents(folder)
     try:
         status = main(shlex.split(line))
     except SystemExit as error:
         status = error.code
-    said = capsys.readouterr().err
-    assert status == 2, said
-    assert said.count("\n") == 1 and said.endswith("\n") and "Traceback" not in said, said
-    assert [part for part in parts if part not in said] == [], said
-    assert contents(folder) == before
+    message = capsys.readouterr().err
+    assert status == 2, message
+    assert message.count("\n") == 1 and message.endswith("\n") and "Traceback" not in message, message
+    assert [part for part in parts if part not in message] == [], message
+    assert contents(folder) == initial_contents
 
 
 T, Y = np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]])
@@ -226,9 +226,9 @@ CALLS = [
 @pytest.mark.parametrize("case", CALLS)
 def test_calls(case, folder):
     call, error, *parts = case
-    before = contents(folder)
+    initial_contents = contents(folder)
     with pytest.raises(error) as raised:
         call()
-    said = str(raised.value)
-    assert "\n" not in said and [part for part in parts if part not in said] == [], said
-    assert contents(folder) == before
+    message = str(raised.value)
+    assert "\n" not in message and [part for part in parts if part not in message] == [], message
+    assert contents(folder) == initial_contents

@@ -56,8 +56,8 @@ def test_a_masked_entry_is_nan(use):
 
 
 def test_whole_numbers_lists_and_panels_keep_their_mask():
-    whole = masked(dtype=int)
-    assert lfm.Data(TIMES, whole, ("x",)).y[2:7, 0].tolist()[1:4] == pytest.approx([np.nan] * 3, nan_ok=True)
+    integers = masked(dtype=int)
+    assert lfm.Data(TIMES, integers, ("x",)).y[2:7, 0].tolist()[1:4] == pytest.approx([np.nan] * 3, nan_ok=True)
     panel = lfm.panel(lambda level: lfm.LatentForceModel(
         lambda x, u, t: u - 0.3 * x, {"f": lfm.Matern(1.0, 3.0)}, MODEL.observation,
         lfm.Gaussian(level, jnp.eye(1))), jnp.zeros((2, 1)), TIMES)

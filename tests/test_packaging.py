@@ -25,16 +25,16 @@ def test_a_wheel_runs_outside_the_checkout(tmp_path):
     (information,) = site.glob("*.dist-info")
     assert {path.name for path in site.iterdir()} == {"lfm_ppl", information.name}
     assert {path.name for path in (site / "lfm_ppl/_models").glob("*.py")} == MODELS
-    inside = site / "lfm_ppl/_studies"
-    assert {path.relative_to(inside) for path in inside.rglob("*.py")} == STUDIES
+    studies_folder = site / "lfm_ppl/_studies"
+    assert {path.relative_to(studies_folder) for path in studies_folder.rglob("*.py")} == STUDIES
     assert (site / "lfm_ppl/py.typed").is_file()
     assert (information / "licenses/LICENSE").read_text() == (ROOT / "LICENSE").read_text()
     assert "lfm-ppl = lfm_ppl.__main__:main" in (information / "entry_points.txt").read_text()
     (version,) = re.findall(r"^Version: (\S+)$", (information / "METADATA").read_text(), re.MULTILINE)
     environment = {"PYTHONPATH": str(site), "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
-    said = [subprocess.run([sys.executable, "-m", "lfm_ppl", *arguments], cwd=tmp_path, env=environment, check=True,
-                           capture_output=True, text=True, timeout=300).stdout
-            for arguments in (["--version"], ["models"], ["compare", "ballistic", "--help"])]
-    assert said[0] == f"lfm_ppl {version}\n"
-    assert all(name.removesuffix(".py").replace("_", "-") in said[1] for name in MODELS)
-    assert "--particle-runs" in said[2]  # a setting of the study
+    outputs = [subprocess.run([sys.executable, "-m", "lfm_ppl", *arguments], cwd=tmp_path, env=environment, check=True,
+                              capture_output=True, text=True, timeout=300).stdout
+               for arguments in (["--version"], ["models"], ["compare", "ballistic", "--help"])]
+    assert outputs[0] == f"lfm_ppl {version}\n"
+    assert all(name.removesuffix(".py").replace("_", "-") in outputs[1] for name in MODELS)
+    assert "--particle-runs" in outputs[2]  # a setting of the study

@@ -24,22 +24,22 @@ RESOLVED = 1e6
 """Standard deviation above which a periodic function of a state is chance, and so is its derivative."""
 
 
-def log_likelihood(one: Structure, known_times, parameters, times, y):
+def log_likelihood(spec: Structure, known_times, parameters, times, y):
     times = times if known_times is None else known_times
-    return lfm.MarginalLikelihood(build(one, parameters), times, rule=one.rule, steps=one.steps).log_prob(y)
+    return lfm.MarginalLikelihood(build(spec, parameters), times, rule=spec.rule, steps=spec.steps).log_prob(y)
 
 
-def results(one: Structure, known_times, parameters, times, y):
+def results(spec: Structure, known_times, parameters, times, y):
     """Filter and smoother in one pass, in two, and beyond the data."""
     times = times if known_times is None else known_times
     join = jnp.concatenate if known_times is None else np.concatenate
-    model, options = build(one, parameters), {"rule": one.rule, "steps": one.steps}
-    nothing = jnp.full((len(AHEAD), one.outputs), jnp.nan)
+    model, options = build(spec, parameters), {"rule": spec.rule, "steps": spec.steps}
+    nothing = jnp.full((len(AHEAD), spec.outputs), jnp.nan)
     later = times[-1] + AHEAD
     passed = lfm.filter(model, times, y, **options)
     first = lfm.filter(model, times[:CUT], y[:CUT], **options)
     second = lfm.filter(model, times[CUT:], y[CUT:], **options, start=first.state)
-    ahead = lfm.filter(model, later, nothing, **options, start=passed.state)
+    forecast = lfm.filter(model, later, nothing, **options, start=passed.state)
     smoothed = lfm.smooth(model, join([times, later]), jnp.concatenate([y, nothing]), **options, iterations=0)
     return {
         "log likelihood": passed.log_likelihood,
@@ -48,16 +48,16 @@ def results(one: Structure, known_times, parameters, times, y):
         "smoothed": smoothed.covariance[:ROWS],
         "in two windows": jnp.concatenate([first.log_likelihood, second.log_likelihood]),
         "last means": jnp.stack([passed.filtered_mean[-1], second.filtered_mean[-1]]),
-        "forecast means": jnp.stack([ahead.predicted_mean, smoothed.mean[ROWS:]]),
-        "forecast covariances": jnp.stack([ahead.predicted_covariance, smoothed.covariance[ROWS:]]),
+        "forecast means": jnp.stack([forecast.predicted_mean, smoothed.mean[ROWS:]]),
+        "forecast covariances": jnp.stack([forecast.predicted_covariance, smoothed.covariance[ROWS:]]),
     }
 
 
 def central_differences(function, parameters, direction, step):
-    ahead, behind = ({name: value + sign * step * direction[name] for name, value in parameters.items()}
-                     for sign in (1, -1))
+    upper, lower = ({name: value + sign * step * direction[name] for name, value in parameters.items()}
+                    for sign in (1, -1))
     with np.errstate(invalid="ignore"):  # -inf less -inf
-        return (np.asarray(function(ahead)[0]) - np.asarray(function(behind)[0])) / (2 * step)
+        return (np.asarray(function(upper)[0]) - np.asarray(function(lower)[0])) / (2 * step)
 
 
 def variances(covariance):
@@ -66,58 +66,61 @@ def variances(covariance):
 
 def complaints(seed: int, count: int) -> list[str]:
     """Return what does not hold for a structure, one line a complaint."""
-    one = structure(seed)
-    drawn = batch(one, count)
-    known_times = drawn.times[0] if one.jumps else None
-    value_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(partial(log_likelihood, one, known_times))))
-    with_data = lambda parameters: value_and_gradient(parameters, drawn.times, drawn.y)  # noqa: E731
-    values, gradient = with_data(drawn.parameters)
+    spec = structure(seed)
+    data = batch(spec, count)
+    known_times = data.times[0] if spec.jumps else None
+    value_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(partial(log_likelihood, spec, known_times))))
+
+    def with_data(parameters):
+        return value_and_gradient(parameters, data.times, data.y)
+
+    values, gradient = with_data(data.parameters)
 
     generator = np.random.default_rng(5)
-    direction = {name: generator.normal(size=v.shape) * np.abs(v) for name, v in drawn.parameters.items()}
+    direction = {name: generator.normal(size=v.shape) * np.abs(v) for name, v in data.parameters.items()}
     along = sum((np.asarray(gradient[name]) * direction[name]).reshape(count, -1).sum(1) for name in direction)
-    coarse, fine = (central_differences(with_data, drawn.parameters, direction, step) for step in (1e-6, 2.5e-7))
-    result = jax.jit(jax.vmap(partial(results, one, known_times)))(*drawn)
+    coarse, fine = (central_differences(with_data, data.parameters, direction, step) for step in (1e-6, 2.5e-7))
+    result = jax.jit(jax.vmap(partial(results, spec, known_times)))(*data)
 
-    said = []
+    failures = []
     for index in range(count):
         single = jax.tree_util.tree_map(lambda a: np.asarray(a)[index], result)  # noqa: B023
         slopes = along[index], coarse[index], fine[index]
         gradients = np.concatenate([np.asarray(g)[index].ravel() for g in gradient.values()])
-        lines = _of_series(one, float(values[index]), gradients, slopes, single)
-        said += [f"structure {seed}, series {index}: {line}" for line in lines]
-    return said + [f"structure {seed}: {line}" for line in _of_known_numbers(one, drawn, result)]
+        lines = _of_series(spec, float(values[index]), gradients, slopes, single)
+        failures += [f"structure {seed}, series {index}: {line}" for line in lines]
+    return failures + [f"structure {seed}: {line}" for line in _of_known_numbers(spec, data, result)]
 
 
-def _of_series(one: Structure, value: float, gradient: np.ndarray, slopes: tuple, result: dict) -> list[str]:
+def _of_series(spec: Structure, value: float, gradient: np.ndarray, slopes: tuple, result: dict) -> list[str]:
     if not np.isfinite(gradient).all():
         return ["the gradient is not finite"]
     if value == -np.inf:
         return ["the log likelihood is -inf, but its gradient is not zero"] if gradient.any() else []
     if not np.isfinite(value):
         return [f"the log likelihood is {value}"]
-    said = []
+    failures = []
 
-    def expect(small: float, most: float, what: str) -> None:
+    def expect(small: float, most: float, quantity: str) -> None:
         if not small <= most:
-            said.append(f"{what}: {small:.1e}")
+            failures.append(f"{quantity}: {small:.1e}")
 
     total = float(result["log likelihood"].sum())
     iterated = float(result["iterated log likelihood"].sum())
     expect(abs(value - iterated), 1e-6 * max(1.0, abs(iterated)), "distribution and smoother")
     expect(abs(result["in two windows"].sum() - total), 1e-6 * max(1.0, abs(total)), "in two windows and in one")
-    whole, windows = result["last means"]
-    expect(np.max(np.abs(whole - windows) / np.maximum(1.0, np.abs(whole))), 1e-5, "last means")
+    full_means, windows = result["last means"]
+    expect(np.max(np.abs(full_means - windows) / np.maximum(1.0, np.abs(full_means))), 1e-5, "last means")
 
     slope, coarse, fine = slopes
     scale = max(1.0, abs(slope))
-    if one.linear or np.sqrt(variances(result["predicted"]).max()) < RESOLVED:
+    if spec.linear or np.sqrt(variances(result["predicted"]).max()) < RESOLVED:
         expect(abs(slope - fine) / scale, max(1e-3, 30 * abs(coarse - fine) / scale), "gradient and differences")
 
     largest = variances(result["predicted"]).max(0)
     for name in ("predicted", "filtered", "smoothed"):
         expect(np.max(-variances(result[name]) - 1e-12 * largest), 0.0, f"negative variance, {name}")
-    if one.linear:
+    if spec.linear:
         filtered = variances(result["filtered"])
         floor = np.maximum(1e-9 * variances(result["predicted"]), 1e-12)
         excess = (variances(result["smoothed"]) - filtered) / np.maximum(filtered, floor)
@@ -128,16 +131,16 @@ def _of_series(one: Structure, value: float, gradient: np.ndarray, slopes: tuple
     expect(np.max(np.abs(means[0] - means[1]) / np.maximum(sd, 1e-6 * np.abs(means[0]))), 1e-4, "forecast means")
     expect(np.max(np.abs(covariances[0] - covariances[1]) / (sd[:, :, None] * sd[:, None, :])), 1e-4,
            "forecast covariances")
-    return said
+    return failures
 
 
-def _of_known_numbers(one: Structure, drawn: Series, result: dict) -> list[str]:
+def _of_known_numbers(spec: Structure, data: Series, result: dict) -> list[str]:
     """The same outside of compiled code, where structure and time grid are read off the numbers."""
     finite = np.flatnonzero(np.isfinite(np.asarray(result["log likelihood"])).all(1))
     if not finite.size:
         return []
-    parameters, times, y = jax.tree_util.tree_map(lambda a: a[finite[0]], drawn)
-    eager = lfm.filter(build(one, parameters), times, y, rule=one.rule, steps=one.steps).log_likelihood.sum()
+    parameters, times, y = jax.tree_util.tree_map(lambda a: a[finite[0]], data)
+    eager = lfm.filter(build(spec, parameters), times, y, rule=spec.rule, steps=spec.steps).log_likelihood.sum()
     difference = abs(float(eager) - float(result["log likelihood"][finite[0]].sum()))
     return [] if difference <= 1e-6 * max(1.0, abs(float(eager))) else [f"known numbers and traced: {difference:.1e}"]
 
@@ -151,9 +154,9 @@ def test_a_few_structures(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("first", range(0, 300, 5))
 def test_many_structures(first):
-    said = []
+    failures = []
     for seed in range(first, first + 5):
-        said += complaints(seed, MANY)
+        failures += complaints(seed, MANY)
         jax.clear_caches()
         forget_executables()
-    assert not said, "\n".join(said)
+    assert not failures, "\n".join(failures)

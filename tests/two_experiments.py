@@ -24,7 +24,7 @@ def system(name, rate):
         lfm.Gaussian(jnp.array([START[name]]), 0.01 * jnp.eye(1)))
 
 
-def both(times, y):
+def joint_model(times, y):
     """Both experiments, with times and data by name."""
     rate = numpyro.sample("a", dist.LogNormal(-1.0, 0.5))
     for name in ("y", "y2"):

@@ -19,12 +19,12 @@ def home(tmp_path, monkeypatch):
     """An empty cache folder; the configuration of JAX is restored afterwards."""
     names = ("jax_compilation_cache_dir", "jax_compilation_cache_max_size",
              "jax_persistent_cache_min_compile_time_secs")
-    before = {name: getattr(jax.config, name) for name in names}
+    saved_settings = {name: getattr(jax.config, name) for name in names}
     jax.config.update("jax_compilation_cache_dir", None)
     monkeypatch.delenv(session.SWITCH, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     yield tmp_path / "cache"
-    for name, value in before.items():
+    for name, value in saved_settings.items():
         jax.config.update(name, value)
 
 

@@ -10,7 +10,7 @@ from lfm_ppl.results.result_view import ResultView
 
 
 def test_check_prints_stores_and_draws(run, fitted):
-    before = arviz_data.load(fitted)
+    unchecked_result = arviz_data.load(fitted)
     status, out, err = run(f"check {fitted} --draws 40")
     assert status == 0, err
     for words in ("grid", "Pareto k", "depth", "verdict"):
@@ -18,11 +18,12 @@ def test_check_prints_stores_and_draws(run, fitted):
     for name in ("posterior.nc (group accuracy)", "accuracy.csv", "accuracy.png", "report.html"):
         assert f"wrote    {fitted / name}" in out
     assert f"lfm-ppl check {fitted} --draws 40</pre>" in (fitted / "report.html").read_text()
-    after = arviz_data.load(fitted)
-    assert set(ResultView.of(after).groups) == {*ResultView.of(before).groups, "accuracy"}
-    for name in ResultView.of(before).groups:
-        assert ResultView.of(after).group(name).identical(ResultView.of(before).group(name)), "nothing is lost"
-    report = AccuracyReport.of(after)
+    checked_result = arviz_data.load(fitted)
+    assert set(ResultView.of(checked_result).groups) == {*ResultView.of(unchecked_result).groups, "accuracy"}
+    for name in ResultView.of(unchecked_result).groups:
+        group = ResultView.of(unchecked_result).group(name)
+        assert ResultView.of(checked_result).group(name).identical(group), "nothing is lost"
+    report = AccuracyReport.of(checked_result)
     assert report.log_ratio.shape == (2, 20)
     table = pd.read_csv(fitted / "accuracy.csv", index_col="parameter")
     np.testing.assert_allclose(table.loc["depth", "shift"], report.table.loc["depth", "shift"])
@@ -41,7 +42,7 @@ def test_new_chains_follow_a_check_that_requires_them(run, well, fitted, monkeyp
     arviz_data.save(arviz_data.add_group(result, "accuracy", report), fitted / "posterior.nc", overwrite=True)
     reports = []
     monkeypatch.setattr("lfm_ppl.cli.check._correct", lambda *arguments: reports.append(arguments[2]) or 0)
-    monkeypatch.setattr("lfm_ppl.cli.check.check_accuracy", lambda *rest, **keywords: pytest.fail("checked again"))
+    monkeypatch.setattr("lfm_ppl.cli.check.check_accuracy", lambda *arguments, **keywords: pytest.fail("checked again"))
     status, out, err = run(f"check {fitted} --correct")
     assert status == 0 and reports[0].k == 0.9, err
     changed = fitted.parent / "changed.py"
@@ -92,10 +93,10 @@ def test_exact_chains_where_the_weights_are_not_reliable(run, fitted, monkeypatc
 def test_mistakes_are_one_line(run, well, fitted, tmp_path, line, words):
     with open(well) as file:
         (tmp_path / "other.py").write_text(file.read().replace('OUTPUTS = ("x",)', 'OUTPUTS = ("z",)'))
-    before = sorted(path.name for path in fitted.iterdir())
+    initial_files = sorted(path.name for path in fitted.iterdir())
     status, _, err = run(line.replace("RESULT", str(fitted)))
     assert status == 2 and err.startswith("lfm-ppl: error: ") and err.count("\n") == 1 and words in err, err
-    assert sorted(path.name for path in fitted.iterdir()) == before
+    assert sorted(path.name for path in fitted.iterdir()) == initial_files
 
 
 def test_a_result_without_its_model_file(run, fitted):

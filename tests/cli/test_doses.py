@@ -115,13 +115,13 @@ def test_subjects_of_a_file_are_fitted_together_with_their_doses(files, run):
     lfm.save(lfm.select_series(result, "Bo"), files / "bo")
     status, _, errors = run(f"forecast bo --held-out {files}/later.csv --events AMT:gut --draws 10 --out ahead")
     assert status == 0, errors
-    ahead = arviz_data.load("ahead")
-    alone = ResultView.of(ahead).group("predictions")["outputs"][..., 0]
+    forecast = arviz_data.load("ahead")
+    alone = ResultView.of(forecast).group("predictions")["outputs"][..., 0]
     assert alone.dims == ("chain", "draw", "time") and alone["time"].values.tolist() == [12.0, 14.0]
-    assert ResultView.of(ahead).group("predictions_constant_data")["AMT"].values.tolist()[-2:] == [4.0, 4.0]
-    again = lfm.forecast(lfm.select_series(result, "Bo"), load(str(files / "panel.py")).model, [12.0, 14.0], draws=10,
-                         inputs={"AMT": ([8.0, 12.0], [4.0, 4.0], "dose:gut")}, progress=False)
-    np.testing.assert_allclose(ResultView.of(again).group("predictions")["outputs"][..., 0], alone)
+    assert ResultView.of(forecast).group("predictions_constant_data")["AMT"].values.tolist()[-2:] == [4.0, 4.0]
+    python_forecast = lfm.forecast(lfm.select_series(result, "Bo"), load(str(files / "panel.py")).model, [12.0, 14.0],
+                                   draws=10, inputs={"AMT": ([8.0, 12.0], [4.0, 4.0], "dose:gut")}, progress=False)
+    np.testing.assert_allclose(ResultView.of(python_forecast).group("predictions")["outputs"][..., 0], alone)
     rate = float(ResultView.of(lfm.select_series(result, "Bo")).posterior["ke"][0, 0])
     expected = sum(4 * 1.3 / (1.3 - rate) * (np.exp(-rate * gap) - np.exp(-1.3 * gap)) for gap in (6.0, 2.0))
     assert float(alone[0, 0, 1]) == pytest.approx(expected, rel=1e-6)

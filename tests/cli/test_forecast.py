@@ -25,35 +25,35 @@ def test_a_forecast_writes_table_figures_group_and_scores(run, fitted, tmp_path)
     held_out.write_text("time,x\n6,-0.9\n7,\n7.5,-1.2\n")
     status, out, err = run(f"forecast {fitted} --held-out {held_out} --draws 30 --out ahead")
     assert status == 0, err
-    ahead = tmp_path / "ahead"
-    assert {path.name for path in ahead.iterdir()} == {
+    folder = tmp_path / "ahead"
+    assert {path.name for path in folder.iterdir()} == {
         "posterior.nc", "forecast.csv", "forecast.png", "forecast-states.png", "scores.csv", "report.html"}
-    stored = arviz_data.load(ahead)
+    stored = arviz_data.load(folder)
     later = ResultView.of(stored).group("held_out_data")["y"]
     np.testing.assert_array_equal(later.sel(output="x"), [-0.9, np.nan, -1.2])
-    table = pd.read_csv(ahead / "forecast.csv")
+    table = pd.read_csv(folder / "forecast.csv")
     assert table["time"].tolist() == [6.0, 7.0, 7.5] and (table["q97.5"] > table["noise_free_q97.5"]).all()
-    scores = pd.read_csv(ahead / "scores.csv", index_col="output")
+    scores = pd.read_csv(folder / "scores.csv", index_col="output")
     expected = lfm.score(stored, lfm.Data([6.0, 7.0, 7.5], [[-0.9], [np.nan], [-1.2]], ("x",)))
     np.testing.assert_allclose(scores.to_numpy(float), expected.to_numpy(float))
-    page = (ahead / "report.html").read_text()
+    page = (folder / "report.html").read_text()
     assert f"lfm-ppl forecast {fitted} --held-out" in page and page.count("data:image/png;base64,") == 2
-    assert run(f"forecast {ahead} --until 8 --draws 30 --overwrite")[0] == 0
-    assert pd.read_csv(ahead / "forecast.csv")["time"].tolist() == [6.0, 7.0, 8.0]  # at the spacing of the data
-    assert "held_out_data" not in ResultView.of(arviz_data.load(ahead)).groups
+    assert run(f"forecast {folder} --until 8 --draws 30 --overwrite")[0] == 0
+    assert pd.read_csv(folder / "forecast.csv")["time"].tolist() == [6.0, 7.0, 8.0]  # at the spacing of the data
+    assert "held_out_data" not in ResultView.of(arviz_data.load(folder)).groups
 
 
 @pytest.mark.thorough
 def test_predictions_are_replaced_only_with_overwrite(run, fitted):
-    before = ResultView.of(arviz_data.load(fitted)).group("predictions")
+    stored_predictions = ResultView.of(arviz_data.load(fitted)).group("predictions")
     status, _, err = run(f"forecast {fitted} --at 9")
     assert status == 2 and "already holds predictions" in err and not (fitted / "forecast.csv").exists()
-    assert ResultView.of(arviz_data.load(fitted)).group("predictions").equals(before)
+    assert ResultView.of(arviz_data.load(fitted)).group("predictions").equals(stored_predictions)
     status, _, err = run(f"forecast {fitted} --at 6,7,7.5 --overwrite --draws 30")
     assert status == 0, err
-    after = arviz_data.load(fitted)
-    assert ResultView.of(after).group("predictions")["time"].values.tolist() == [6.0, 7.0, 7.5]
-    assert "trajectories" in ResultView.of(after).groups
+    replaced_result = arviz_data.load(fitted)
+    assert ResultView.of(replaced_result).group("predictions")["time"].values.tolist() == [6.0, 7.0, 7.5]
+    assert "trajectories" in ResultView.of(replaced_result).groups
 
 
 @pytest.mark.slow

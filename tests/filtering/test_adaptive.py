@@ -54,15 +54,15 @@ def test_slow_and_stiff_models_are_integrated_to_the_tolerance(rule):
 @pytest.mark.slow
 def test_a_model_that_is_not_linear_in_its_force_only_is_integrated_to_the_tolerance():
     """With a fast and a slow state; gradients in both modes."""
-    y, at = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]]), jnp.array([8.0, 8.0, 0.6])
+    y, theta = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]]), jnp.array([8.0, 8.0, 0.6])
 
     def log_prob(parameters, tolerance, steps):
         return expression(parameters, tolerance, steps, link=lambda u: jax.nn.sigmoid(3.0 * u)).log_prob(y)
 
-    exact, gradient = jax.jit(jax.value_and_grad(lambda p: log_prob(p, None, 400)))(at)
+    exact, gradient = jax.jit(jax.value_and_grad(lambda p: log_prob(p, None, 400)))(theta)
     (loose, tight), reverse, forward = jax.jit(lambda p: (
         (log_prob(p, 1e-1, 100), log_prob(p, 1e-5, 100)), jax.grad(log_prob)(p, 1e-5, 100),
-        jax.jacfwd(log_prob)(p, 1e-5, 100)))(at)
+        jax.jacfwd(log_prob)(p, 1e-5, 100)))(theta)
     assert abs(tight - exact) < 1e-2
     assert abs(tight - exact) < abs(loose - exact)
     np.testing.assert_allclose(reverse, forward, rtol=1e-9)
@@ -71,10 +71,13 @@ def test_a_model_that_is_not_linear_in_its_force_only_is_integrated_to_the_toler
 
 @pytest.mark.thorough
 def test_gradients_are_those_of_the_exact_integration_in_both_modes():
-    at = SLOW_TO_STIFF[0]
-    adaptive = lambda p: double_well(p, lfm.Taylor(), tolerance=1e-5).log_prob(Y)  # noqa: E731
-    exact = jax.jit(jax.jacfwd(lambda p: double_well(p, lfm.Taylor(), steps=400).log_prob(Y)))(at)
-    reverse, forward = jax.jit(lambda p: (jax.grad(adaptive)(p), jax.jacfwd(adaptive)(p)))(at)
+    theta = SLOW_TO_STIFF[0]
+
+    def adaptive(p):
+        return double_well(p, lfm.Taylor(), tolerance=1e-5).log_prob(Y)
+
+    exact = jax.jit(jax.jacfwd(lambda p: double_well(p, lfm.Taylor(), steps=400).log_prob(Y)))(theta)
+    reverse, forward = jax.jit(lambda p: (jax.grad(adaptive)(p), jax.jacfwd(adaptive)(p)))(theta)
     np.testing.assert_allclose(reverse, forward, rtol=1e-10)
     np.testing.assert_allclose(reverse, exact, rtol=1e-4)
 
@@ -82,8 +85,8 @@ def test_gradients_are_those_of_the_exact_integration_in_both_modes():
 @pytest.mark.slow
 def test_a_rejected_step_does_not_spoil_the_derivative():
     """A first step of an eighth of the interval would overflow."""
-    at = jnp.array([-3.0, 40.0, 5.0])
-    result = jax.jit(jax.value_and_grad(lambda p: double_well(p, tolerance=1e-3, steps=1000).log_prob(Y)))(at)
+    theta = jnp.array([-3.0, 40.0, 5.0])
+    result = jax.jit(jax.value_and_grad(lambda p: double_well(p, tolerance=1e-3, steps=1000).log_prob(Y)))(theta)
     assert np.isfinite(result[0])
     assert np.isfinite(result[1]).all()
 
@@ -140,8 +143,8 @@ def test_derivatives_with_respect_to_times():
 @pytest.mark.slow
 def test_smoother_draws_and_requested_times():
     y = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]])
-    at = np.array([0.0, 0.7, 2.0, 5.1, 9.5])
-    exact, result = expression().smooth(y, at=at), expression(tolerance=1e-7, steps=60).smooth(y, at=at)
+    grid = np.array([0.0, 0.7, 2.0, 5.1, 9.5])
+    exact, result = expression().smooth(y, at=grid), expression(tolerance=1e-7, steps=60).smooth(y, at=grid)
     np.testing.assert_allclose(result.mean, exact.mean, atol=1e-4)
     np.testing.assert_allclose(result.covariance, exact.covariance, atol=1e-4)
     np.testing.assert_allclose(result.leave_one_out, exact.leave_one_out, atol=1e-3)
@@ -157,10 +160,10 @@ def test_replicates_gaps_and_a_row_of_its_own_for_each_call():
     y = np.full((5, 2), 0.7)
     exact = expression(times=times, steps=2000).log_prob(y)
     np.testing.assert_allclose(expression(times=times, tolerance=1e-6, steps=200).log_prob(y), exact, atol=1e-3)
-    whole = lfm.filter(expression().model, TIMES, y, tolerance=1e-4, steps=60)
+    full_result = lfm.filter(expression().model, TIMES, y, tolerance=1e-4, steps=60)
     first = lfm.filter(expression().model, TIMES[:3], y[:3], tolerance=1e-4, steps=60)
-    then = lfm.filter(expression().model, TIMES[3:], y[3:], tolerance=1e-4, steps=60, start=first.state)
-    np.testing.assert_allclose(then.log_likelihood, whole.log_likelihood[3:], rtol=1e-10)
+    second = lfm.filter(expression().model, TIMES[3:], y[3:], tolerance=1e-4, steps=60, start=first.state)
+    np.testing.assert_allclose(second.log_likelihood, full_result.log_likelihood[3:], rtol=1e-10)
 
 
 @pytest.mark.slow
@@ -190,14 +193,14 @@ def test_what_a_tolerance_cannot_be():
 
 
 class Cascade(eqx.Module):
-    """Each state makes the next one; ``units`` are those of the states."""
+    """Each state drives the next; ``units`` are the units of the states."""
 
     units: Any
 
     def __call__(self, x, u, t):
         x = x / self.units
-        made = jnp.concatenate([jax.nn.softplus(u), x[:-1] / (1.0 + x[:-1] ** 2)])
-        return (made - 0.5 * x) * self.units
+        production = jnp.concatenate([jax.nn.softplus(u), x[:-1] / (1.0 + x[:-1] ** 2)])
+        return (production - 0.5 * x) * self.units
 
 
 class Last(eqx.Module):

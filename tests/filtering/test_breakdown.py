@@ -79,11 +79,11 @@ def exact_log_likelihood(times, y, noise):
     with localcontext() as context:
         context.prec = 400
         rates, row, log_2pi = decimal(RATES), decimal(np.ones(2)), Decimal(2 * np.pi).ln()
-        mean, covariance, now, total = decimal(np.zeros(2)), decimal(np.eye(2)), Decimal(0), Decimal(0)
+        mean, covariance, previous_time, total = decimal(np.zeros(2)), decimal(np.eye(2)), Decimal(0), Decimal(0)
         for time, value in zip(decimal(times), decimal(y), strict=True):
-            phi = np.array([(rate * (time - now)).exp() for rate in rates])
+            phi = np.array([(rate * (time - previous_time)).exp() for rate in rates])
             added = Decimal("0.25") * (phi**2 - 1) / (2 * rates)
-            mean, covariance, now = phi * mean, phi[:, None] * covariance * phi + np.diag(added), time
+            mean, covariance, previous_time = phi * mean, phi[:, None] * covariance * phi + np.diag(added), time
             variance, innovation = row @ covariance @ row + Decimal(noise), value - row @ mean
             total -= (innovation**2 / variance + variance.ln() + log_2pi) / 2
             gain = covariance @ row / variance

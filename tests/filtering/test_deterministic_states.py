@@ -75,9 +75,9 @@ def test_small_variances_lead_to_the_deterministic_limit(build, name):
                        else lfm.StudentTObservation(predictor, 4.0, jnp.exp(theta[2])))
         return lfm.MarginalLikelihood(build(theta, observation, variance), TIMES, steps=40).log_prob(y[:, None])
 
-    both, reference = (jax.jit(jax.value_and_grad(function)) for function in (log_prob, exact))
+    evaluate, reference = (jax.jit(jax.value_and_grad(function)) for function in (log_prob, exact))
     for variance in VARIANCES:
-        value, gradient = both(THETA, variance)
+        value, gradient = evaluate(THETA, variance)
         expected, slope = reference(THETA, variance)
         assert float(value) == pytest.approx(float(expected), rel=1e-9)
         np.testing.assert_allclose(gradient, slope, rtol=2e-8, atol=1e-8)
@@ -94,7 +94,7 @@ def test_deterministic_and_uncertain_outputs_side_by_side():
     def errors(theta):
         return lfm.StudentTObservation(lambda x, u, t: u, 4.0, jnp.exp(theta[2]))
 
-    def both(theta):
+    def mixed_likelihood(theta):
         observation = lfm.Observations(lfm.PoissonObservation(lambda x, u, t: x), errors(theta))
         return lfm.MarginalLikelihood(decay(theta, observation, forces=forces), TIMES)
 
@@ -106,11 +106,11 @@ def test_deterministic_and_uncertain_outputs_side_by_side():
         return jnp.where(np.isnan(y[:, 0]), 0.0, jnp.nan_to_num(y[:, 0]) * f - jnp.exp(f)
                          - gammaln(jnp.nan_to_num(y[:, 0]) + 1.0))
 
-    result = jax.jit(jax.value_and_grad(lambda theta: both(theta).log_prob(y)))(theta)
+    result = jax.jit(jax.value_and_grad(lambda theta: mixed_likelihood(theta).log_prob(y)))(theta)
     parts = jax.jit(jax.value_and_grad(lambda theta: alone(theta).log_prob(y[:, 1:]) + counted(theta).sum()))(theta)
     for value, expected in zip(result, parts, strict=True):
         np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-9)
-    smoothed, of_force = both(theta).smooth(y), alone(theta).smooth(y[:, 1:])
+    smoothed, of_force = mixed_likelihood(theta).smooth(y), alone(theta).smooth(y[:, 1:])
     np.testing.assert_allclose(smoothed.leave_one_out, of_force.leave_one_out + counted(theta), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(smoothed.force("u").sd, of_force.force("u").sd, rtol=1e-9)
 

@@ -197,13 +197,13 @@ def test_an_event_before_the_initial_time_or_at_no_time_has_no_density(lag):
     np.testing.assert_array_equal(value, -np.inf)
     assert slope(jnp.ones(2))[0] == 0.0
 
-    def others(lag):
+    def evaluate_other_methods(lag):
         particles = lfm.particle_filter(jax.random.key(0), delayed(lag), times, y, particles=10)
         return (lfm.filter(delayed(lag), times, y).log_likelihood.sum(), particles.log_likelihood.sum(),
                 lfm.smooth(delayed(lag), times, y).log_likelihood.sum(),
                 lfm.simulate(jax.random.key(0), delayed(lag), times).state.sum())
 
-    *densities, state = jax.jit(others)(lag)
+    *densities, state = jax.jit(evaluate_other_methods)(lag)
     np.testing.assert_array_equal(densities, -np.inf)
     assert np.isnan(state)
 
@@ -225,9 +225,9 @@ def test_simulation_without_noise_is_the_mean():
     model = absorption(1.3, 0.2, [lfm.Dose(DOSES, AMOUNTS, "gut"), lfm.Reset([7.0], "blood", 1.0)])
     state = lfm.simulate(jax.random.key(0), model, TIMES, steps=100).state
     np.testing.assert_allclose(state, lfm.smooth(model, TIMES, ONES).mean, atol=1e-6)
-    before = absorption(1.3, 0.2, [lfm.Dose(TIMES, 1.0, "blood", observation_first=False)])
-    assert lfm.simulate(jax.random.key(0), before, TIMES).state[0, 1] == 1.0
-    assert lfm.filter(before, TIMES, ONES).predicted_mean[0, 1] == 1.0
+    dose_first_model = absorption(1.3, 0.2, [lfm.Dose(TIMES, 1.0, "blood", observation_first=False)])
+    assert lfm.simulate(jax.random.key(0), dose_first_model, TIMES).state[0, 1] == 1.0
+    assert lfm.filter(dose_first_model, TIMES, ONES).predicted_mean[0, 1] == 1.0
 
 
 @pytest.mark.thorough
@@ -259,9 +259,9 @@ def test_iterated_linearisation_finds_the_most_probable_trajectory():
         initial_time=0.0, state_names=("gut", "blood"),
         events=[lfm.Dose(DOSES, AMOUNTS, "gut"), lfm.Reset([9.0, 20.0], "blood", 0.5)])
     y = lfm.simulate(jax.random.key(1), model, TIMES).y
-    at = np.arange(0.0, 30.5, 0.5)
-    smoothed = lfm.smooth(model, TIMES, y, rule=lfm.Taylor(), iterations=30, steps=20, at=at)
-    estimate = lfm.full_information(model, TIMES, y, lower={"f": -50.0}, grid=at, steps=20)
+    requested_times = np.arange(0.0, 30.5, 0.5)
+    smoothed = lfm.smooth(model, TIMES, y, rule=lfm.Taylor(), iterations=30, steps=20, at=requested_times)
+    estimate = lfm.full_information(model, TIMES, y, lower={"f": -50.0}, grid=requested_times, steps=20)
     np.testing.assert_allclose(estimate.state_mean, smoothed.mean[:, :2], atol=2e-3)
 
 
@@ -269,10 +269,10 @@ def test_a_continued_filter_equals_one_pass():
     events = [lfm.Dose(DOSES, AMOUNTS, "gut"), lfm.Dose([12.0], 1.0, "blood", observation_first=False)]
     model = absorption(1.3, 0.2, events, forces={"f": lfm.Matern(0.3, 4.0)})
     y = lfm.simulate(jax.random.key(1), model, TIMES).y
-    whole = lfm.filter(model, TIMES, y)
+    full_result = lfm.filter(model, TIMES, y)
     first = lfm.filter(model, TIMES[:5], y[:5])  # ends at a time with two doses
     second = lfm.filter(model, TIMES[5:], y[5:], start=first.state)
-    np.testing.assert_allclose(second.filtered_mean, whole.filtered_mean[5:], atol=1e-9)
+    np.testing.assert_allclose(second.filtered_mean, full_result.filtered_mean[5:], atol=1e-9)
 
 
 @pytest.mark.thorough

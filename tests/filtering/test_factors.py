@@ -155,15 +155,15 @@ def test_evidence_and_moments_of_many_records(name):
             first, spread = exact_moments(y)
         computed.append([abs(log_evidence - log_z), np.max(np.abs(mean - first) / spread),
                       np.max(np.abs(sd / spread - 1.0)), error])
-    away = np.array(computed)
-    print(f"{name}: log evidence, means, sds, error of the reference: median {np.median(away, 0).round(3)}, "
-          f"largest {away.max(0).round(3)}")
-    away = away[away[:, 3] < 0.02]
-    assert len(away) == 16 and away[:, 0].max() < 0.2 and away[:, 1].max() < 0.05
+    errors = np.array(computed)
+    print(f"{name}: log evidence, means, sds, error of the reference: median {np.median(errors, 0).round(3)}, "
+          f"largest {errors.max(0).round(3)}")
+    errors = errors[errors[:, 3] < 0.02]
+    assert len(errors) == 16 and errors[:, 0].max() < 0.2 and errors[:, 1].max() < 0.05
     if name == "Student-t":
-        assert np.median(away[:, 2]) < 0.03 and away[:, 2].max() < 0.16
+        assert np.median(errors[:, 2]) < 0.03 and errors[:, 2].max() < 0.16
     else:
-        assert away[:, 2].max() < 0.025
+        assert errors[:, 2].max() < 0.025
 
 
 def differences(value, theta, h=1e-3):
@@ -217,16 +217,16 @@ def test_update_in_natural_parameters_against_dense_algebra():
     # The joint state (s, e) has the precision of the prior and of the factors.
     prior = np.zeros((7, 7))
     prior[:4, :4], prior[4:, 4:] = p, omega + 1e-13 * np.eye(3)
-    both = np.concatenate([h, np.eye(3)], axis=1)
-    precision = np.linalg.inv(prior) + both.T @ np.diag(tau) @ both
+    observation_matrix = np.concatenate([h, np.eye(3)], axis=1)
+    precision = np.linalg.inv(prior) + observation_matrix.T @ np.diag(tau) @ observation_matrix
     posterior = np.linalg.inv(precision)
-    shift = both.T @ (nu - tau * (value - centre))
+    shift = observation_matrix.T @ (nu - tau * (value - centre))
     result = multiply_by_factors(LinearizedObservation(jnp.asarray(value), jnp.asarray(h), jnp.asarray(omega)),
                               Factors(*map(jnp.asarray, (centre, nu, tau))), Moments(jnp.asarray(m), jnp.asarray(p)))
     np.testing.assert_allclose(result.moments.mean, m + (posterior @ shift)[:4], rtol=1e-8)
     np.testing.assert_allclose(result.moments.covariance, posterior[:4, :4], rtol=1e-8)
-    away = value - centre
-    integral = (nu @ away - 0.5 * away @ (tau * away) + 0.5 * shift @ posterior @ shift
+    residual = value - centre
+    integral = (nu @ residual - 0.5 * residual @ (tau * residual) + 0.5 * shift @ posterior @ shift
                 - 0.5 * np.linalg.slogdet(prior)[1] - 0.5 * np.linalg.slogdet(precision)[1])
     assert result.log_likelihood == pytest.approx(integral, rel=1e-6)
 
@@ -349,7 +349,7 @@ COUNTS = np.array([1.0, 2.0, 0.0, 3.0])[:, None]
 
 @pytest.mark.slow
 def test_replicates_with_steps_that_follow_a_tolerance():
-    """Smoothed moments are those of counts that follow each other at once."""
+    """Smoothed moments equal the moments of counts that follow each other at once."""
     result, expected = (lfm.smooth(pushed(THETA), times, COUNTS, lfm.Taylor(), tolerance=1e-2)
                        for times in (AT_ONCE, ONE_AFTER_ANOTHER))
     np.testing.assert_allclose(result.input_mean, expected.input_mean, rtol=1e-6)
@@ -368,10 +368,10 @@ def test_factors_that_do_not_converge_leave_assumed_density_filtering_to_a_model
     def distribution(th):
         return lfm.MarginalLikelihood(pushed(th), TIMES[:6], steps=1, factors=HOPELESS)
 
-    both = jax.jit(jax.value_and_grad(lambda th: distribution(th).log_prob(y)))
-    value, gradient = both(theta)
+    evaluate = jax.jit(jax.value_and_grad(lambda th: distribution(th).log_prob(y)))
+    value, gradient = evaluate(theta)
     assert value == pytest.approx(float(distribution(theta).log_prob_per_observation(y).sum()), abs=1e-10)
-    np.testing.assert_allclose(gradient, differences(lambda th: both(th)[0], theta), atol=1e-6)
+    np.testing.assert_allclose(gradient, differences(lambda th: evaluate(th)[0], theta), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -385,8 +385,8 @@ def test_factors_that_do_not_converge_are_told_and_leave_nearly_the_same_force()
     np.testing.assert_array_equal(smoothed.leave_one_out, smoothed.log_likelihood)
     right = lfm.smooth(pushed(theta), TIMES, y, steps=2)
     assert right.converged
-    away = np.abs(np.asarray(smoothed.force("u").mean - right.force("u").mean)) / np.asarray(right.force("u").sd)
-    assert away.max() < 0.5
+    deviation = np.abs(np.asarray(smoothed.force("u").mean - right.force("u").mean)) / np.asarray(right.force("u").sd)
+    assert deviation.max() < 0.5
 
 
 @pytest.mark.slow
@@ -394,8 +394,8 @@ def test_assumed_density_filtering_is_a_density_of_several_entries_a_row():
     """Of two rows of two correlated answers the probabilities of all sixteen add up to one."""
     model = process(lfm.BernoulliObservation(lambda x, u, t: jnp.concatenate([2.0 * u, 0.5 - 3.0 * u])))
     distribution = lfm.MarginalLikelihood(model, np.array([0.0, 0.7]))
-    every = np.array(list(itertools.product([0.0, 1.0], repeat=4))).reshape(16, 2, 2)
-    log_prob = jax.vmap(lambda y: distribution.log_prob_per_observation(y).sum())(every)
+    records = np.array(list(itertools.product([0.0, 1.0], repeat=4))).reshape(16, 2, 2)
+    log_prob = jax.vmap(lambda y: distribution.log_prob_per_observation(y).sum())(records)
     assert float(jnp.exp(log_prob).sum()) == pytest.approx(1.0, abs=1e-7)
 
 
@@ -438,9 +438,9 @@ def test_weighted_draws_of_the_smoother_estimate_the_evidence(name):
     cov = np.cov(np.asarray(result.sample(jax.random.key(0), 4000).forces["u"]).T) * 1.1
     log_z, error, *_ = importance(name, y, np.asarray(result.force("u").mean), cov)
     weight = np.exp(log_weights - log_weights.max())
-    own = weight.std() / weight.mean() / np.sqrt(weight.size)
-    assert own < 0.02
-    assert abs(log_weights.max() + np.log(weight.mean()) - log_z) < 5 * np.hypot(own, error)
+    relative_error = weight.std() / weight.mean() / np.sqrt(weight.size)
+    assert relative_error < 0.02
+    assert abs(log_weights.max() + np.log(weight.mean()) - log_z) < 5 * np.hypot(relative_error, error)
 
 
 @pytest.mark.slow
@@ -452,10 +452,10 @@ def test_a_gap_leaves_the_gradient_of_a_bounded_law_alone():
             dist.Normal(f, 0.7), dist.transforms.SigmoidTransform()))  # no density at 1
         return lfm.MarginalLikelihood(process(observation), times).log_prob(y)
 
-    both = jax.jit(jax.value_and_grad(evidence))
+    evaluate = jax.jit(jax.value_and_grad(evidence))
     step = 1e-5
-    slope = (both(step)[0] - both(-step)[0]) / (2 * step)
-    assert float(both(0.0)[1]) == pytest.approx(float(slope), rel=1e-6)
+    slope = (evaluate(step)[0] - evaluate(-step)[0]) / (2 * step)
+    assert float(evaluate(0.0)[1]) == pytest.approx(float(slope), rel=1e-6)
 
 
 @pytest.mark.slow
@@ -492,6 +492,6 @@ def test_the_gradient_where_points_of_linearisation_depend_on_factors_of_data_th
             lfm.Gaussian(jnp.zeros(1), jnp.array([[0.5]])))
         return lfm.MarginalLikelihood(model, times, steps=2).log_prob(y)
 
-    both, step = jax.jit(jax.value_and_grad(evidence)), 2e-4
-    slopes = [(both(THETA + step * unit)[0] - both(THETA - step * unit)[0]) / (2 * step) for unit in np.eye(3)]
-    np.testing.assert_allclose(both(THETA)[1], slopes, rtol=0.0, atol=1e-4 * np.abs(slopes).max())
+    evaluate, step = jax.jit(jax.value_and_grad(evidence)), 2e-4
+    slopes = [(evaluate(THETA + step * unit)[0] - evaluate(THETA - step * unit)[0]) / (2 * step) for unit in np.eye(3)]
+    np.testing.assert_allclose(evaluate(THETA)[1], slopes, rtol=0.0, atol=1e-4 * np.abs(slopes).max())

@@ -170,11 +170,11 @@ HOURS = np.array([6.0, 12.0, 24.0, 25.0])
 
 
 def concentration(rate, way="previous"):
-    during, rest = np.minimum(HOURS, 24.0), np.maximum(HOURS - 24.0, 0.0)
+    during, elapsed = np.minimum(HOURS, 24.0), np.maximum(HOURS - 24.0, 0.0)
     constant = -np.expm1(-rate * during) / rate
     if way == "previous":
-        return 10.0 * constant * np.exp(-rate * rest) / 20.0
-    return 10.0 * (constant - (during - constant) / rate / 24.0) * np.exp(-rate * rest) / 20.0
+        return 10.0 * constant * np.exp(-rate * elapsed) / 20.0
+    return 10.0 * (constant - (during - constant) / rate / 24.0) * np.exp(-rate * elapsed) / 20.0
 
 
 @pytest.mark.thorough
@@ -261,7 +261,7 @@ def test_other_functions_of_time_converge_and_are_stable():
 
 @pytest.mark.thorough
 def test_fast_decay_of_a_model_that_is_not_linear_in_its_forces():
-    """A state that follows exp(u) within minutes, whose moments are those of exp(u); the steps are as long as an hour.
+    """A state that follows exp(u) within minutes has the moments of exp(u); the steps are as long as an hour.
 
     With the points -1/2 and 1/2 of the rule, exp(u) has the mean cosh(1/2), and sinh(1/2) is the sd of its linear part.
     """

@@ -95,10 +95,13 @@ def test_gradient_equals_central_differences(compiled, name, edge):
             continue  # a variance of zero has no left neighbour
         # Relative steps, Richardson's extrapolation from two of them, and the rounding of the values.
         h = 1e-3 * (abs(theta[index]) if abs(theta[index]) > 1e-10 else 1.0)
-        at = lambda k: float(value(jnp.asarray(theta + k * h * direction), y))  # noqa: E731, B023
-        narrow, wide = (at(0.5) - at(-0.5)) / h, (at(1) - at(-1)) / (2 * h)
+
+        def value_at(k):
+            return float(value(jnp.asarray(theta + k * h * direction), y))  # noqa: B023
+
+        narrow, wide = (value_at(0.5) - value_at(-0.5)) / h, (value_at(1) - value_at(-1)) / (2 * h)
         difference = (4 * narrow - wide) / 3
-        rounding = 1e-12 * max(1.0, abs(at(0))) / h
+        rounding = 1e-12 * max(1.0, abs(value_at(0))) / h
         assert abs(reverse[index] - difference) <= 1e-5 * abs(difference) + rounding, (
             index, reverse[index], difference)
 

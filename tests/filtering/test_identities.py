@@ -24,11 +24,11 @@ def model():
     return motif(variance=0.1)
 
 
-def same(a: Any, b: Any, tolerance: float):
-    for one, other in zip(jax.tree_util.tree_leaves(a), jax.tree_util.tree_leaves(b), strict=True):
-        one, other = np.nan_to_num(one), np.nan_to_num(other)
-        assert one.shape == other.shape
-        assert np.abs(one - other).max() <= tolerance * (1 + np.abs(other).max())
+def assert_same(a: Any, b: Any, tolerance: float):
+    for leaf, expected_leaf in zip(jax.tree_util.tree_leaves(a), jax.tree_util.tree_leaves(b), strict=True):
+        leaf, expected_leaf = np.nan_to_num(leaf), np.nan_to_num(expected_leaf)
+        assert leaf.shape == expected_leaf.shape
+        assert np.abs(leaf - expected_leaf).max() <= tolerance * (1 + np.abs(expected_leaf).max())
 
 
 def moments_of(result):
@@ -53,7 +53,7 @@ def test_projected_points_equal_points_in_the_whole_state_within_their_degree():
         lfm.Gaussian(jnp.array([0.5, 0.2]), 0.05 * jnp.eye(2)))
     result = [lfm.filter(model, TIMES, Y, rule=lfm.GaussHermite(3, full_state=full), steps=2)
              for full in (False, True)]
-    same(moments_of(result[0]), moments_of(result[1]), 1e-10)
+    assert_same(moments_of(result[0]), moments_of(result[1]), 1e-10)
 
 
 @pytest.mark.slow
@@ -61,10 +61,10 @@ def test_replicates_in_any_order(model):
     y = np.array([[0.5, 0.6], [0.9, np.nan], [0.4, 0.8], [0.7, 0.2]])
     times = [1.0, 1.0, 1.0, 2.0]
     order = [2, 0, 1, 3]
-    one, other = (lfm.smooth(model, times, values, steps=5) for values in (y, y[order]))
-    same((one.mean, one.covariance, one.log_likelihood.sum()), (other.mean, other.covariance,
-                                                                other.log_likelihood.sum()), 1e-10)
-    same(one.leave_one_out[jnp.array(order)], other.leave_one_out, 1e-9)
+    ordered, permuted = (lfm.smooth(model, times, values, steps=5) for values in (y, y[order]))
+    assert_same((ordered.mean, ordered.covariance, ordered.log_likelihood.sum()),
+                (permuted.mean, permuted.covariance, permuted.log_likelihood.sum()), 1e-10)
+    assert_same(ordered.leave_one_out[jnp.array(order)], permuted.leave_one_out, 1e-9)
 
 
 @pytest.mark.parametrize("link, error", [(identity, 1e-8), pytest.param(softplus, 2e-3, marks=pytest.mark.slow)])
@@ -101,9 +101,9 @@ def test_replicates_are_one_observation_of_several_outputs():
         return result.log_likelihood.sum(), result.state
 
     theta = jnp.array([0.8, 1.1, 1.3])
-    (one, one_state), slope = jax.value_and_grad(rows, has_aux=True)(theta)
-    (other, other_state), other_slope = jax.value_and_grad(outputs, has_aux=True)(theta)
-    same((one, one_state, slope), (other, other_state, other_slope), 1e-9)
+    (rows_value, rows_state), slope = jax.value_and_grad(rows, has_aux=True)(theta)
+    (outputs_value, outputs_state), outputs_slope = jax.value_and_grad(outputs, has_aux=True)(theta)
+    assert_same((rows_value, rows_state, slope), (outputs_value, outputs_state, outputs_slope), 1e-9)
 
 
 def three_times(x, u, t):
@@ -115,7 +115,7 @@ def three_times(x, u, t):
     for rule in RULES], ids=lambda rule: rule.name)
 def test_rules_agree_on_a_linear_model(rule):
     model = motif(identity, variance=0.1)
-    same(moments_of(lfm.filter(model, TIMES, Y, rule=rule)), moments_of(lfm.filter(model, TIMES, Y)), 1e-10)
+    assert_same(moments_of(lfm.filter(model, TIMES, Y, rule=rule)), moments_of(lfm.filter(model, TIMES, Y)), 1e-10)
 
 
 @pytest.mark.slow
@@ -124,8 +124,8 @@ def test_parameters_and_times_may_be_traced(model):
         return lfm.filter(motif(decay=decay, variance=0.1), times, Y).log_likelihood
 
     batch = jax.jit(jax.vmap(log_likelihood, (0, None)))(jnp.array([0.8, 1.1]), jnp.asarray(TIMES))
-    same(batch, jnp.stack([lfm.filter(motif(decay=decay, variance=0.1), TIMES, Y).log_likelihood
-                           for decay in (0.8, 1.1)]), 1e-10)
+    assert_same(batch, jnp.stack([lfm.filter(motif(decay=decay, variance=0.1), TIMES, Y).log_likelihood
+                                  for decay in (0.8, 1.1)]), 1e-10)
 
 
 @pytest.mark.slow
@@ -134,8 +134,8 @@ def test_more_interval_lengths_than_are_tabulated():
     model = motif(identity, genes=1, variance=0.1)
     times = np.cumsum(np.random.default_rng(2).uniform(0.01, 0.1, size=1300))
     y = np.sin(times)[:, None]
-    whole = lfm.filter(model, times, y)
+    full_result = lfm.filter(model, times, y)
     first = lfm.filter(model, times[:650], y[:650])
     second = lfm.filter(model, times[650:], y[650:], start=first.state)
-    same(whole.log_likelihood, jnp.concatenate([first.log_likelihood, second.log_likelihood]), 1e-10)
-    same(whole.state, second.state, 1e-10)
+    assert_same(full_result.log_likelihood, jnp.concatenate([first.log_likelihood, second.log_likelihood]), 1e-10)
+    assert_same(full_result.state, second.state, 1e-10)

@@ -27,17 +27,17 @@ def decay(events, dynamics=lambda x, u, t: -RATE * x, forces=None):
 def blood(t, amounts=AMOUNTS, durations=DURATIONS, lag=0.0):
     """The sum of infusions that overlap, eliminated at `RATE`."""
     since = np.asarray(t)[:, None] - STARTS - lag
-    during, after = np.clip(since, 0.0, durations), np.maximum(since - durations, 0.0)
-    return (amounts / durations * (1 - np.exp(-RATE * during)) / RATE * np.exp(-RATE * after)).sum(1)
+    during, elapsed = np.clip(since, 0.0, durations), np.maximum(since - durations, 0.0)
+    return (amounts / durations * (1 - np.exp(-RATE * during)) / RATE * np.exp(-RATE * elapsed)).sum(1)
 
 
 def test_overlapping_infusions_superpose_in_all_methods():
     model = decay([lfm.Infusion(STARTS, AMOUNTS, "blood", duration=DURATIONS, lag=0.25)])
     by_rate = decay([lfm.Infusion(STARTS, AMOUNTS, np.ones(1), rate=AMOUNTS / DURATIONS, lag=0.25)])
-    exact, at = blood(TIMES, lag=0.25), np.linspace(0.0, 11.0, 23)
+    exact, grid = blood(TIMES, lag=0.25), np.linspace(0.0, 11.0, 23)
     for system in (model, by_rate):
         np.testing.assert_allclose(lfm.filter(system, TIMES, Y).predicted_mean[:, 0], exact, atol=1e-9)
-    np.testing.assert_allclose(lfm.smooth(model, TIMES, Y, at=at).mean[:, 0], blood(at, lag=0.25), atol=1e-9)
+    np.testing.assert_allclose(lfm.smooth(model, TIMES, Y, at=grid).mean[:, 0], blood(grid, lag=0.25), atol=1e-9)
     path = lfm.simulate(jax.random.key(0), model, TIMES, steps=20).state[:, 0]
     np.testing.assert_allclose(path, exact, atol=1e-6)
     particles = lfm.particle_filter(jax.random.key(0), model, TIMES, Y, particles=3).mean[:, 0]
@@ -109,10 +109,10 @@ def test_series_of_a_panel_have_infusions_of_their_own():
 @pytest.mark.thorough
 def test_a_filter_continues_within_an_infusion():
     model = decay([lfm.Infusion([0.0], 4.0, "blood", duration=4.0)], forces={})
-    whole = lfm.filter(model, TIMES, Y)
+    full_result = lfm.filter(model, TIMES, Y)
     first = lfm.filter(model, TIMES[:3], Y[:3])
     second = lfm.filter(model, TIMES[3:], Y[3:], start=first.state)
-    np.testing.assert_allclose(second.predicted_mean, whole.predicted_mean[3:], atol=1e-9)
+    np.testing.assert_allclose(second.predicted_mean, full_result.predicted_mean[3:], atol=1e-9)
 
 
 @pytest.mark.slow
@@ -172,8 +172,8 @@ def test_regimes_take_the_events_of_one_model():
     switching = lfm.Switching(models, [[0.0, 0.2], [0.5, 0.0]], TIMES)
     exact = lfm.MarginalLikelihood(models["a"], TIMES)
     np.testing.assert_allclose(switching.log_prob(Y), exact.log_prob(Y), rtol=1e-8)
-    at = np.array([1.7, 2.5, 6.0, 7.0])
-    np.testing.assert_allclose(switching.smooth(Y, at=at).mean, lfm.smooth(models["a"], TIMES, Y, at=at).mean,
+    grid = np.array([1.7, 2.5, 6.0, 7.0])
+    np.testing.assert_allclose(switching.smooth(Y, at=grid).mean, lfm.smooth(models["a"], TIMES, Y, at=grid).mean,
                                atol=1e-8)
     path = switching.simulate(jax.random.key(0))[0][:, 0]
     np.testing.assert_allclose(path, lfm.filter(models["a"], TIMES, Y).predicted_mean[:, 0], atol=1e-6)

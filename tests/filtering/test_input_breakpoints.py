@@ -39,16 +39,16 @@ def table(starts, widths, amounts, origin=0.0):
     """The sum of the pulses as one "previous" input."""
     times = np.unique(np.concatenate([[starts.min() - 100.0], starts, starts + widths]))
     middle = np.append(0.5 * (times[1:] + times[:-1]), times[-1] + 1.0)
-    inside = (middle[:, None] > starts) & (middle[:, None] < starts + widths)
-    return lfm.Input(origin + times, inside @ (amounts / widths), "previous", "hold")
+    is_active = (middle[:, None] > starts) & (middle[:, None] < starts + widths)
+    return lfm.Input(origin + times, is_active @ (amounts / widths), "previous", "hold")
 
 
 def exposed(starts, widths, amounts, t, lag=0.0):
     """The linear state at times (T,), which begins at zero."""
     begin, end = np.maximum(starts + lag, 0.0), np.maximum(starts + widths + lag, 0.0)
-    rest = np.clip(t[:, None] - end, 0.0, None)
+    elapsed = np.clip(t[:, None] - end, 0.0, None)
     length = np.clip(np.minimum(t[:, None], end) - begin, 0.0, None)
-    return (amounts / widths / DECAY * -np.expm1(-DECAY * length) * np.exp(-DECAY * rest)).sum(1)
+    return (amounts / widths / DECAY * -np.expm1(-DECAY * length) * np.exp(-DECAY * elapsed)).sum(1)
 
 
 @pytest.mark.parametrize("keywords", [{}, pytest.param({"tolerance": 1e-3, "steps": 20}, marks=pytest.mark.slow)])
@@ -62,7 +62,9 @@ def test_pulse_trains_of_a_linear_model(keywords):
 @pytest.mark.slow
 @pytest.mark.parametrize("keywords", [{}, {"tolerance": 1e-2, "steps": 40}])
 def test_pulse_trains_of_saturable_elimination(keywords):
-    elimination = lambda x: x / (0.8 + x)  # noqa: E731
+    def elimination(x):
+        return x / (0.8 + x)
+
     train = pulses(5)
     rate = table(*train)
     edges = np.unique(np.concatenate([[0.0], np.asarray(rate.times), ROWS]))
@@ -90,8 +92,8 @@ def test_an_offset_that_is_a_number_moves_the_jumps():
     """The table counts from 1970, the model from its first row."""
     starts, widths, amounts = pulses(1)
     # As far as the digits of the table go.
-    starts, ends = ((edge + 1.7e9) - 1.7e9 for edge in (starts, starts + np.maximum(widths, 1e-5)))
-    train = starts, ends - starts, amounts
+    starts, stops = ((edge + 1.7e9) - 1.7e9 for edge in (starts, starts + np.maximum(widths, 1e-5)))
+    train = starts, stops - starts, amounts
     rate = table(*train, origin=1.7e9)
     result = means(system(lambda t: rate(t + 1.7e9)), ROWS)
     np.testing.assert_allclose(result, exposed(*train, ROWS), rtol=1e-8, atol=1e-9)
@@ -101,8 +103,11 @@ def test_kinks_of_a_linear_input():
     """A triangle between two rows, in a model that is exact but for its input."""
     ramp = lfm.Input([-9.0, 2.3, 2.5, 2.8, 99.0], [0.0, 0.0, 4.0, 0.0, 0.0], "linear", "hold")
     result = means(system(ramp), ROWS)
-    corner = lambda edge, t: np.where(t > edge, (t - edge) / DECAY + np.expm1(-DECAY * np.clip(t - edge, 0, None))  # noqa: E731
-                                      / DECAY**2, 0.0)
+
+    def corner(edge, t):
+        return np.where(t > edge, (t - edge) / DECAY + np.expm1(-DECAY * np.clip(t - edge, 0, None))
+                        / DECAY**2, 0.0)
+
     slopes = np.array([20.0, -20.0 - 4 / 0.3, 4 / 0.3])
     expected = sum(a * corner(edge, ROWS) for a, edge in zip(slopes, (2.3, 2.5, 2.8), strict=True))
     np.testing.assert_allclose(result, expected, rtol=1e-7, atol=1e-8)
@@ -113,8 +118,8 @@ def test_only_true_jumps_and_kinks_divide_an_interval():
     nothing = [lfm.Input(fine, np.full(len(fine), 2.0), outside="hold"),
                lfm.Input(ROWS, np.arange(13.0), outside="hold"),  # at the rows
                lfm.Input([-1.0, *fine[1:-1], 13.0], 3.0 * np.array([-1.0, *fine[1:-1], 13.0]), "linear", "hold")]
-    for known in nothing:
-        assert len(build_time_grid(state_space(system(known)), ROWS, 10).intervals.length) == len(ROWS)
+    for known_input in nothing:
+        assert len(build_time_grid(state_space(system(known_input)), ROWS, 10).intervals.length) == len(ROWS)
     jumps = lfm.Input(fine, np.floor(fine / 0.5 + 1e-9), outside="hold")
     grid = build_time_grid(state_space(system(jumps)), ROWS, 10)
     assert len(np.unique(np.round(grid.intervals.end, 9))) >= 25
@@ -133,8 +138,8 @@ def closed_form(lag, second=None):
     return float((-0.5 * ((Y - mean) / 0.2) ** 2 - np.log(0.2 * np.sqrt(2 * np.pi))).sum())
 
 
-def slope(function, at):
-    return (function(at + 1e-6) - function(at - 1e-6)) / 2e-6
+def slope(function, point):
+    return (function(point + 1e-6) - function(point - 1e-6)) / 2e-6
 
 
 def lagged(lag, **keywords):
@@ -155,13 +160,13 @@ def test_value_and_derivative_with_respect_to_a_lag(keywords):
 
 @pytest.mark.slow
 def test_two_lags():
-    def both(lags):
+    def log_prob(lags):
         model = system(lambda t: INFUSION(t - lags[0]) + INFUSION(t - lags[1]))
         return lfm.MarginalLikelihood(model, ROWS).log_prob(Y[:, None])
 
-    at = np.array([1.2, 4.4])
-    value, gradient = jax.jit(jax.value_and_grad(both))(at)
-    np.testing.assert_allclose(value, closed_form(*at), rtol=1e-8)
+    lags = np.array([1.2, 4.4])
+    value, gradient = jax.jit(jax.value_and_grad(log_prob))(lags)
+    np.testing.assert_allclose(value, closed_form(*lags), rtol=1e-8)
     expected = [slope(lambda lag: closed_form(lag, 4.4), 1.2), slope(lambda lag: closed_form(1.2, lag), 4.4)]
     np.testing.assert_allclose(gradient, expected, rtol=1e-4)
 
@@ -178,8 +183,8 @@ def test_a_time_that_bends_with_a_parameter_is_refused():
 def test_simulations_and_particles_do_not_step_over_pulses():
     train = pulses(2)
     model = system(table(*train))
-    drawn = lfm.simulate(jax.random.key(0), model, ROWS, steps=10)
-    np.testing.assert_allclose(drawn.state[:, 0], exposed(*train, ROWS), rtol=1e-5, atol=1e-6)
+    simulation = lfm.simulate(jax.random.key(0), model, ROWS, steps=10)
+    np.testing.assert_allclose(simulation.state[:, 0], exposed(*train, ROWS), rtol=1e-5, atol=1e-6)
     noisy = lfm.LatentForceModel(
         model.dynamics, {}, model.observation, lfm.Gaussian(jnp.zeros(1), 1e-16 * jnp.eye(1)),
         process_noise=lambda x, u, t: 1e-8 * (1.0 + jnp.tanh(x) ** 2)[:, None], initial_time=0.0)
@@ -223,8 +228,11 @@ def test_smoothing_at_requested_times_with_a_traced_lag():
             lambda x, u, t: INFUSION(t - lag) + jnp.tanh(u) - DECAY * x, {"u": lfm.Matern(0.5, 2.0)},
             lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.04])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
 
-    at = np.linspace(0.0, 14.0, 9)
-    run = lambda lag: tuple(getattr(lfm.smooth(forced(lag), ROWS, Y[:, None], at=at), name)  # noqa: E731
-                            for name in ("mean", "covariance"))
+    requested_times = np.linspace(0.0, 14.0, 9)
+
+    def run(lag):
+        return tuple(getattr(lfm.smooth(forced(lag), ROWS, Y[:, None], at=requested_times), name)
+                     for name in ("mean", "covariance"))
+
     for result, expected in zip(jax.jit(run)(1.37), run(1.37), strict=True):
         np.testing.assert_allclose(result, expected, atol=2e-3)

@@ -25,15 +25,15 @@ def log_prob(parameters, times=TIMES):
 @pytest.mark.thorough
 @pytest.mark.parametrize("block", [8, 128])
 def test_stored_transitions_equal_tabulated_ones(monkeypatch, block):
-    at = jnp.array([1.3, 0.4, 0.8])
-    tabulated = jax.value_and_grad(log_prob)(at)
+    theta = jnp.array([1.3, 0.4, 0.8])
+    tabulated = jax.value_and_grad(log_prob)(theta)
     monkeypatch.setattr(time_grid, "_LARGEST_TABLE", 0)
     monkeypatch.setattr(intervals, "_BLOCK", block)
-    value, gradient = jax.value_and_grad(log_prob)(at)
+    value, gradient = jax.value_and_grad(log_prob)(theta)
     np.testing.assert_allclose(value, tabulated[0], rtol=1e-12)
     np.testing.assert_allclose(gradient, tabulated[1], rtol=1e-10)
-    np.testing.assert_allclose(jax.jacfwd(log_prob)(at), gradient, rtol=1e-10)
-    differences = [(log_prob(at + d) - log_prob(at - d)) / (2 * d.sum()) for d in 1e-5 * jnp.eye(3)]
+    np.testing.assert_allclose(jax.jacfwd(log_prob)(theta), gradient, rtol=1e-10)
+    differences = [(log_prob(theta + d) - log_prob(theta - d)) / (2 * d.sum()) for d in 1e-5 * jnp.eye(3)]
     np.testing.assert_allclose(gradient, differences, rtol=1e-6)
 
 

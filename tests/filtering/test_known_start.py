@@ -16,8 +16,8 @@ DECAY, SENSITIVITY = jnp.array([0.801797, 1.170477, 0.801614]), jnp.array([0.96,
 def genes(link, variance=0.0, integrated=False):
     """Three decays pushed by one force; ``integrated``: with a term in t that is never there, so that it is stepped."""
     def dynamics(x, u, t):
-        made = SENSITIVITY * link(u[0]) - DECAY * x
-        return made + jnp.where(t > 1e6, 1.0, 0.0) if integrated else made
+        rate = SENSITIVITY * link(u[0]) - DECAY * x
+        return rate + jnp.where(t > 1e6, 1.0, 0.0) if integrated else rate
 
     return lfm.LatentForceModel(
         dynamics, {"u": lfm.Matern(1.0, 2.0, order=1)},

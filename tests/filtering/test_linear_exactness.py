@@ -63,7 +63,10 @@ def linear_case(j, b, forces, kernels, *, output, start=0.0, variance=None, nois
         lfm.GaussianObservation(Outputs(jnp.asarray(output)), noise * jnp.ones(outputs)),
         lfm.Gaussian(jnp.asarray(mean), jnp.asarray(covariance)), initial_time=start,
         process_noise=None if dispersion is None else jnp.asarray(dispersion))
-    add = lambda t: constant + (0.0 if reference_additive is None else reference_additive(t))  # noqa: E731
+
+    def add(t):
+        return constant + (0.0 if reference_additive is None else reference_additive(t))
+
     process = LinearLFM(j, b, kernels, start, mean, covariance, means, add, dispersion, breaks=breaks)
     return Case(model, Regression(process, output, noise * np.ones(outputs)), TIMES, data(outputs), steps)
 
@@ -102,14 +105,14 @@ STATES = np.eye(2, 3)
 def _cases() -> dict[str, Any]:
     m = lfm.Matern
     genes = {"j": GENES, "b": SENSITIVITY, "output": STATES}
-    one = {"forces": {"u": m(1.0, 1.3, 1)}, "kernels": [matern(1.0, 1.3, 1)]}
+    single = {"forces": {"u": m(1.0, 1.3, 1)}, "kernels": [matern(1.0, 1.3, 1)]}
     positions = np.array([[1.0, 0, 0, 0, 0], [0, 0, 1, 0, 0]])
     heated = {"constant": 0.2, "additive": Heated(heater()), "breaks": (0.5, 1.0, 3.0, 6.5),
               "reference_additive": lambda t: np.array([np.interp(t, [0.5, 1.0, 3.0, 6.5], [0.0, 2.0, -1.0, 0.5]), 0])}
     return {
         **{f"matern {p}": lambda p=p: regression(p) for p in range(6)},
-        "motif, known start": lambda: linear_case(**genes, **one, constant=0.3),
-        "motif, uncertain start": lambda: linear_case(**genes, **one, variance=[[0.5, 0.2], [0.2, 0.3]], start=-1.0),
+        "motif, known start": lambda: linear_case(**genes, **single, constant=0.3),
+        "motif, uncertain start": lambda: linear_case(**genes, **single, variance=[[0.5, 0.2], [0.2, 0.3]], start=-1.0),
         "motif, rough force and process noise": lambda: linear_case(
             **genes, forces={"u": m(1.0, 1.3, 0)}, kernels=[matern(1.0, 1.3, 0)],
             dispersion=np.array([[0.3, 0.0], [0.1, 0.2]]), variance=np.eye(2)),
@@ -120,16 +123,16 @@ def _cases() -> dict[str, Any]:
             [matern(1.0, 1.3, 1), added(matern(0.7, 0.6, 2), matern(0.5, 3.0, 0))],
             output=[[1.0, 0, 0, 0], [0, 1.0, 0, 0.5]]),
         "constant mean": lambda: linear_case(
-            **genes, forces={"u": m(1.0, 1.3, 1, mean=1.5)}, kernels=one["kernels"],
+            **genes, forces={"u": m(1.0, 1.3, 1, mean=1.5)}, kernels=single["kernels"],
             means=[lambda t: np.full_like(t, 1.5)], variance=np.eye(2)),
         "mean function": lambda: linear_case(
-            **genes, forces={"u": m(1.0, 1.3, 1, mean=smooth_wave)}, kernels=one["kernels"], means=[wave_numpy],
+            **genes, forces={"u": m(1.0, 1.3, 1, mean=smooth_wave)}, kernels=single["kernels"], means=[wave_numpy],
             steps=100),
         "additive function": lambda: linear_case(
-            **genes, **one, additive=scaled_wave, steps=100,
+            **genes, **single, additive=scaled_wave, steps=100,
             reference_additive=lambda t: np.array([1.0, -0.5]) * np.cos(0.7 * t)),
         # The filter's rows end at the kinks of the input.
-        "known input": lambda: linear_case(**genes, **one, **heated, steps=100),
+        "known input": lambda: linear_case(**genes, **single, **heated, steps=100),
     }
 
 
@@ -189,16 +192,16 @@ def test_filter(name):
     present = np.isfinite(case.y)
     # Whitened residuals are another way to write the same quadratic form.
     assert np.array_equal(np.isfinite(result.whitened_innovation), present)
-    whole = case.reference.joint(case.times, case.y)
-    residual, k = whole[1][present.ravel()], whole[2][np.ix_(present.ravel(), present.ravel())]
+    joint = case.reference.joint(case.times, case.y)
+    residual, k = joint[1][present.ravel()], joint[2][np.ix_(present.ravel(), present.ravel())]
     close(np.nansum(np.asarray(result.whitened_innovation) ** 2), residual @ np.linalg.solve(k, residual))
 
 
 @pytest.mark.slow
 def test_initial_time_defaults_to_the_first_observation():
     times = TIMES
-    given = CASES["motif, uncertain start"]().model
-    model = lfm.LatentForceModel(given.dynamics, given.forces, given.observation, given.initial_state)
+    system = CASES["motif, uncertain start"]().model
+    model = lfm.LatentForceModel(system.dynamics, system.forces, system.observation, system.initial_state)
     moved = CASES["motif, uncertain start"]().reference
     moved.process.start = times[0]
     y = data(2)
@@ -250,13 +253,15 @@ GRADIENTS = {
 def derivatives():
     """Value, reverse-mode and forward-mode gradient of each builder, compiled once."""
     y = jnp.asarray(data(2))
-    made = {}
+    compiled = {}
 
     def derivative(build):
-        if build not in made:
-            value = lambda theta: lfm.MarginalLikelihood(build(theta), TIMES, steps=2).log_prob(y)  # noqa: E731
-            made[build] = jax.jit(lambda theta: (value(theta), jax.grad(value)(theta), jax.jacfwd(value)(theta)))
-        return made[build]
+        if build not in compiled:
+            def value(theta):
+                return lfm.MarginalLikelihood(build(theta), TIMES, steps=2).log_prob(y)
+
+            compiled[build] = jax.jit(lambda theta: (value(theta), jax.grad(value)(theta), jax.jacfwd(value)(theta)))
+        return compiled[build]
 
     return derivative
 

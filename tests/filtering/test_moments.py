@@ -48,7 +48,10 @@ def predicted(model, rule, count):
 def test_double_well(name, variance):
     rule, make = RULES[name]
     model = double_well(variance=variance)
-    drift = lambda x, t: x - x**3  # noqa: E731
+
+    def drift(x, t):
+        return x - x**3
+
     mean, covariance = moments(drift, lambda x, t: np.array([[0.49]]), make and make(1), [0.5], [[variance]],
                                (0.0, END), lambda x, t: np.array([1 - 3 * x**2]).reshape(1, 1),
                                average_jacobian=name == "MonteCarlo")
@@ -134,7 +137,10 @@ class TimeVarying(eqx.Module):
                          ids=lambda rule: rule.name)
 def test_linear_with_coefficients_that_depend_on_time(rule):
     lam = 1.0 / 0.7
-    matrix = lambda t: np.array([[-(1.0 + 0.5 * np.sin(3 * t)), np.cos(2 * t)], [0.0, -lam]])  # noqa: E731
+
+    def matrix(t):
+        return np.array([[-(1.0 + 0.5 * np.sin(3 * t)), np.cos(2 * t)], [0.0, -lam]])
+
     mean, covariance = moments(lambda s, t: matrix(t) @ s, lambda s, t: np.diag([0.0, 2 * lam]), None, [1.0, 0.0],
                                np.diag([0.0, 1.0]), (0.0, END), lambda s, t: matrix(t))
     model = lfm.LatentForceModel(
@@ -167,5 +173,5 @@ def test_steps_are_rows():
     model = double_well()
     many = predicted(model, lfm.Cubature(), 10)
     result = lfm.filter(model, [END], [[0.8]], steps=10)
-    one = np.append(result.predicted_mean, result.predicted_covariance)
-    assert np.abs(many - one).max() < 1e-13
+    single_row = np.append(result.predicted_mean, result.predicted_covariance)
+    assert np.abs(many - single_row).max() < 1e-13

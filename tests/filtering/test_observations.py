@@ -57,8 +57,8 @@ def test_covariance_that_depends_on_the_state(rule, points):
     model = lfm.LatentForceModel(
         *ONE, lfm.GaussianObservation(first_state, lambda x, u, t: 0.1 + 0.5 * x**2 + t), PRIOR)
     result = lfm.filter(model, [0.0], [[0.7]], rule=rule)
-    at = np.array([0.2]) if points is None else 0.2 + np.sqrt(0.3) * points.nodes[:, 0]
-    noise = (np.ones(1) if points is None else points.weights) @ (0.1 + 0.5 * at**2)
+    nodes = np.array([0.2]) if points is None else 0.2 + np.sqrt(0.3) * points.nodes[:, 0]
+    noise = (np.ones(1) if points is None else points.weights) @ (0.1 + 0.5 * nodes**2)
     s = 0.3 + noise
     assert np.isclose(result.log_likelihood[0], -0.5 * (0.25 / s + np.log(2 * np.pi * s)), rtol=1e-10)
     assert np.isclose(result.filtered_mean[0, 0], 0.2 + 0.3 / s * 0.5, rtol=1e-10)
@@ -119,16 +119,16 @@ def bearing(x, u, t):
 def test_angles_are_averaged_on_the_circle(rule):
     """A bearing next to the branch cut at pi, and the same picture turned by half a circle."""
 
-    def one(sign, angle):
+    def filter_angle(sign, angle):
         model = lfm.LatentForceModel(
             lambda x, u, t: -x, {}, lfm.GaussianObservation(bearing, jnp.array([0.01]), angular=(0,)),
             lfm.Gaussian(sign * jnp.array([-1.0, 0.01]), 0.01 * jnp.eye(2)))
         return lfm.filter(model, [0.0], [[angle]], rule=rule)
 
-    cut, away = one(1.0, np.pi - 0.05), one(-1.0, -0.05)
-    assert np.allclose(cut.log_likelihood, away.log_likelihood, rtol=1e-9)
-    assert np.allclose(cut.filtered_mean, -away.filtered_mean, rtol=1e-9)
-    assert np.allclose(cut.filtered_covariance, away.filtered_covariance, rtol=1e-9)
+    cut, opposite = filter_angle(1.0, np.pi - 0.05), filter_angle(-1.0, -0.05)
+    assert np.allclose(cut.log_likelihood, opposite.log_likelihood, rtol=1e-9)
+    assert np.allclose(cut.filtered_mean, -opposite.filtered_mean, rtol=1e-9)
+    assert np.allclose(cut.filtered_covariance, opposite.filtered_covariance, rtol=1e-9)
 
 
 def square_observed(x, u, t):
@@ -159,11 +159,11 @@ def test_jumps(link):
     model = lfm.LatentForceModel(ONE[0], {"u": force}, lfm.GaussianObservation(first_state, jnp.array([0.1])), PRIOR,
                                  initial_time=0.0)
     if link is identity:
-        at = np.array([0.5, 0.6, 1.7, 2.0, 3.0])
+        requested_times = np.array([0.5, 0.6, 1.7, 2.0, 3.0])
         reference = dense(np.array([0.1]))
         reference.process.kernels, reference.process.breaks = [kernel], kicks[:3]
-        result = lfm.smooth(model, TIMES, Y, at=at)
-        mean, cov = reference.posterior(TIMES, Y, at)
+        result = lfm.smooth(model, TIMES, Y, at=requested_times)
+        mean, cov = reference.posterior(TIMES, Y, requested_times)
         assert np.isclose(result.log_likelihood.sum(), reference.log_likelihood(TIMES, Y), rtol=1e-9)
         assert np.allclose(result.input_mean, mean, atol=1e-9)
         assert np.allclose(result.input_covariance, cov[np.arange(5), np.arange(5)], atol=1e-9)
@@ -172,9 +172,9 @@ def test_jumps(link):
         nonlinear = eqx.tree_at(lambda m: m.forces["u"], motif(softplus, genes=1), force)
         # Without memory a jump makes everything that the force knew irrelevant.
         result = lfm.filter(nonlinear, TIMES, Y)
-        other = lfm.filter(motif(softplus, genes=1), TIMES, Y)
-        assert np.isclose(result.log_likelihood[0], other.log_likelihood[0], rtol=1e-10)  # before any jump
-        assert abs(result.log_likelihood[3] - other.log_likelihood[3]) > 1e-3
+        without_jumps = lfm.filter(motif(softplus, genes=1), TIMES, Y)
+        assert np.isclose(result.log_likelihood[0], without_jumps.log_likelihood[0], rtol=1e-10)  # before any jump
+        assert abs(result.log_likelihood[3] - without_jumps.log_likelihood[3]) > 1e-3
         stationary = np.asarray(force.initial_covariance())
         alone = lfm.filter(nonlinear, [5.0], [[0.4]])
         assert np.abs(alone.predicted_covariance[0, 1:, 1:] - stationary).max() < 1e-10
@@ -234,16 +234,16 @@ def test_iterations_that_go_back_and_forth_meet():
 @pytest.fixture(scope="module")
 def draws():
     model = lfm.LatentForceModel(*ONE, lfm.GaussianObservation(first_state, jnp.array([0.1])), PRIOR, initial_time=0.0)
-    at = np.array([0.0, 0.7, 1.0, 1.8, 4.0])
-    result = lfm.smooth(model, TIMES, Y, at=at)
+    requested_times = np.array([0.0, 0.7, 1.0, 1.8, 4.0])
+    result = lfm.smooth(model, TIMES, Y, at=requested_times)
     sample = result.sample(jax.random.key(0), 4000)
-    return at, np.concatenate([sample.state, sample.forces["u"][:, :, None]], axis=2)
+    return requested_times, np.concatenate([sample.state, sample.forces["u"][:, :, None]], axis=2)
 
 
 def test_trajectories_have_the_joint_posterior(draws):
     """Mean, and covariance between all times, of x and u, within the Monte Carlo error."""
-    at, sample = draws
-    mean, cov = dense(np.array([0.1])).posterior(TIMES, Y, at)
+    requested_times, sample = draws
+    mean, cov = dense(np.array([0.1])).posterior(TIMES, Y, requested_times)
     flat = sample.reshape(len(sample), -1)
     expected = cov.transpose(0, 2, 1, 3).reshape(flat.shape[1], -1)
     sd = np.sqrt(np.diag(expected))

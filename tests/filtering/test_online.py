@@ -18,12 +18,12 @@ TIMES = np.cumsum(np.random.default_rng(0).uniform(0.1, 0.3, 24))
 Y = np.where(np.arange(24) % 5 == 3, np.nan, np.random.default_rng(1).normal(size=24))[:, None]
 
 
-def same(parts, whole):
+def assert_same(parts, full_result):
     """Every field of the parts, one after the other, equals that of the whole."""
     for name in ("times", "log_likelihood", "predicted_mean", "predicted_covariance", "filtered_mean",
                  "filtered_covariance", "whitened_innovation"):
         joined = np.concatenate([getattr(part, name) for part in parts])
-        np.testing.assert_allclose(joined, getattr(whole, name), rtol=1e-10, atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(joined, getattr(full_result, name), rtol=1e-10, atol=1e-12, err_msg=name)
 
 
 def stream(cuts):
@@ -35,21 +35,21 @@ def stream(cuts):
 
 
 @pytest.fixture(scope="module")
-def whole():
+def full_result():
     return lfm.filter(MODEL, TIMES, Y, steps=3)
 
 
-def test_one_observation_at_a_time(whole, caplog, tmp_path):
+def test_one_observation_at_a_time(full_result, caplog, tmp_path):
     """Also those that are missing altogether, and from a saved state; after the second nothing more is compiled."""
     parts = stream(range(1, 24))
-    same(parts, whole)
+    assert_same(parts, full_result)
     np.savez(tmp_path / "state.npz", *map(np.asarray, parts[7].state))
     with np.load(tmp_path / "state.npz") as arrays:
         state = lfm.FilterState(*(jnp.asarray(arrays[name]) for name in arrays.files))
     with jax.log_compiles(), caplog.at_level("DEBUG"):
-        again = lfm.filter(MODEL, TIMES[8:9], Y[8:9], steps=3, start=state)
+        row_result = lfm.filter(MODEL, TIMES[8:9], Y[8:9], steps=3, start=state)
     assert not [record for record in caplog.records if "ompil" in record.message and "filter_on" in record.message]
-    np.testing.assert_array_equal(again.filtered_mean, parts[8].filtered_mean)
+    np.testing.assert_array_equal(row_result.filtered_mean, parts[8].filtered_mean)
     with pytest.raises(ValueError, match="max_step.*start"):
         jax.jit(lambda state: lfm.filter(MODEL, TIMES[8:], Y[8:], max_step=0.1, start=state))(state)
 

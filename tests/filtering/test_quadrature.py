@@ -94,10 +94,10 @@ def predictions(integrator, ssm, rule, steps):
         return [integrator.predict(dynamics, table, interval, steps, record)
                 for record in (Record.SMOOTHER, Record.LINEARIZATION)]
 
-    def both(moments):
+    def predict_both(moments):
         return row(moments, None), row(moments, nodes(ssm, steps))
 
-    return jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(both))(starts(ssm)))
+    return jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(predict_both))(starts(ssm)))
 
 
 @pytest.mark.slow
@@ -109,8 +109,8 @@ def test_quadrature_converges_to_runge_kutta_in_the_fourth_order(name):
 
     def difference(steps):
         result, expected = (predictions(integrator, ssm, rule, steps) for integrator in (Quadrature(), RungeKutta()))
-        return max(np.abs(one - other).max(initial=0.0) / np.abs(other).max(initial=1.0)
-                   for one, other in zip(*map(jax.tree_util.tree_leaves, (result, expected)), strict=True))
+        return max(np.abs(leaf - expected_leaf).max(initial=0.0) / np.abs(expected_leaf).max(initial=1.0)
+                   for leaf, expected_leaf in zip(*map(jax.tree_util.tree_leaves, (result, expected)), strict=True))
 
     coarse, fine = difference(4), difference(8)
     assert coarse < 1e-3

@@ -89,8 +89,8 @@ def link(x, u, t):
 @pytest.mark.slow
 def test_iterations_across_jumps_converge_with_the_steps():
     """The state just before a jump is a node of its own, so that finer steps change little."""
-    one = model(lfm.QuasiPeriodic(kernel(), forces.SQM(0.5, POINTS), functions=1), link)
-    coarse, fine = (lfm.smooth(one, TIMES, Y, steps=steps, iterations=2) for steps in (4, 8))
+    system = model(lfm.QuasiPeriodic(kernel(), forces.SQM(0.5, POINTS), functions=1), link)
+    coarse, fine = (lfm.smooth(system, TIMES, Y, steps=steps, iterations=2) for steps in (4, 8))
     assert abs(float(coarse.log_likelihood.sum() - fine.log_likelihood.sum())) < 1e-3
     np.testing.assert_allclose(coarse.mean, fine.mean, atol=1e-2)
 
@@ -103,9 +103,9 @@ def test_a_panel_is_a_loop():
     parameters = {"lengthscale": jnp.array([1.0, 2.0]), "period": jnp.array([3.0, 2.5])}
     y = jnp.stack([jnp.asarray(Y), 2.0 * jnp.asarray(Y)])
     result = jax.jit(lambda p, y: lfm.panel(build, p, TIMES).log_prob(y))(parameters, y)
-    each = [lfm.MarginalLikelihood(build({"lengthscale": a, "period": b}), TIMES).log_prob(one)
-            for a, b, one in zip((1.0, 2.0), (3.0, 2.5), y, strict=True)]
-    np.testing.assert_allclose(result, each, rtol=1e-10)
+    expected = [lfm.MarginalLikelihood(build({"lengthscale": a, "period": b}), TIMES).log_prob(series)
+                for a, b, series in zip((1.0, 2.0), (3.0, 2.5), y, strict=True)]
+    np.testing.assert_allclose(result, expected, rtol=1e-10)
 
 
 @pytest.mark.slow

@@ -151,11 +151,12 @@ def test_gradients(options):
         return lfm.MarginalLikelihood(model, times, lfm.Taylor(), method="exponential", iterations=0,
                                       **options).log_prob(y)
 
-    at = jnp.array([200.0, 3.0])
-    gradient = log_prob(at)[1]
+    theta = jnp.array([200.0, 3.0])
+    gradient = log_prob(theta)[1]
     assert np.isfinite(gradient).all()
     if "tolerance" not in options:  # whose number of steps jumps with the parameters
-        differences = [(log_prob(at + d)[0] - log_prob(at - d)[0]) / (2 * d.sum()) for d in jnp.diag(1e-5 * at)]
+        differences = [(log_prob(theta + d)[0] - log_prob(theta - d)[0]) / (2 * d.sum())
+                       for d in jnp.diag(1e-5 * theta)]
         np.testing.assert_allclose(gradient, differences, rtol=1e-5)
 
 

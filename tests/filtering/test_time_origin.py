@@ -78,9 +78,9 @@ def test_a_known_input_is_read_on_the_side_of_the_interval():
     values = np.random.default_rng(3).normal(size=ROWS)
 
     def model(table):
-        known = lfm.Input(table, values)
+        signal = lfm.Input(table, values)
         return lfm.LatentForceModel(
-            lambda x, u, t: 1e4 * (known(t) - x), {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
+            lambda x, u, t: 1e4 * (signal(t) - x), {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
             lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
 
     y = np.zeros((ROWS, 1))

@@ -1,4 +1,4 @@
-"""Draws of trajectories have the moments that the smoother reports, and these are those of dense algebra."""
+"""Draws of trajectories have the moments that the smoother reports, which are the moments by dense algebra."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ def standardised(covariance):
 
 def assert_draws_have_the_moments_of(result):
     """Errors of a correlation and of a share of a variance are 0.7% and 1% from 20,000 draws: 4.5 of these."""
-    drawn = result.sample(jax.random.key(3), DRAWS)
-    forces = [np.asarray(drawn.forces[name])[..., None] for name in result.force_names]
-    w = np.concatenate([np.asarray(drawn.state), *forces], axis=2)
+    sample = result.sample(jax.random.key(3), DRAWS)
+    forces = [np.asarray(sample.forces[name])[..., None] for name in result.force_names]
+    w = np.concatenate([np.asarray(sample.state), *forces], axis=2)
     mean, covariance = np.asarray(result.input_mean), np.asarray(result.input_covariance)
-    wanted, scale = standardised(covariance)
-    away = (w - mean) * scale
-    computed = np.einsum("dki,dkj->kij", away, away) / DRAWS
-    np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=4.5 / np.sqrt(DRAWS))
+    expected, scale = standardised(covariance)
+    residual = (w - mean) * scale
+    computed = np.einsum("dki,dkj->kij", residual, residual) / DRAWS
+    np.testing.assert_allclose(residual.mean(axis=0), 0.0, atol=4.5 / np.sqrt(DRAWS))
     variances = np.diagonal(computed, axis1=1, axis2=2)[scale > 0]
     np.testing.assert_allclose(np.sqrt(variances), 1.0, atol=0.02)
-    np.testing.assert_allclose(computed, wanted, atol=4.5 * np.sqrt(2.0 / DRAWS))
-    still = np.broadcast_to(scale == 0, away.shape)
-    assert np.abs((w - mean)[still]).max(initial=0.0) < 1e-9, "what is known does not vary"
+    np.testing.assert_allclose(computed, expected, atol=4.5 * np.sqrt(2.0 / DRAWS))
+    is_constant = np.broadcast_to(scale == 0, residual.shape)
+    assert np.abs((w - mean)[is_constant]).max(initial=0.0) < 1e-9, "what is known does not vary"
 
 
 @functools.cache
@@ -52,10 +52,10 @@ def observed(genes, link):
     return y
 
 
-def check(link, genes, variance, steps, iterations, at=AT, noise_sd=0.0682):
+def check(link, genes, variance, steps, iterations, requested_times=AT, noise_sd=0.0682):
     model = motif(link, genes=genes, variance=variance, noise_sd=noise_sd)
     assert_draws_have_the_moments_of(
-        lfm.smooth(model, TIMES, observed(genes, link), steps=steps, iterations=iterations, at=at))
+        lfm.smooth(model, TIMES, observed(genes, link), steps=steps, iterations=iterations, at=requested_times))
 
 
 @pytest.mark.parametrize(("link", "genes", "variance", "steps", "iterations"), [
@@ -69,7 +69,7 @@ def test_draws_have_the_reported_moments(link, genes, variance, steps, iteration
 @pytest.mark.slow
 def test_draws_of_many_steps_at_the_data_have_the_reported_moments():
     """What moves five genes over an interval is of rank two but for rounding, and no ``at`` corrects the draws."""
-    check(softplus, 5, 1.0, 50, 0, at=None)
+    check(softplus, 5, 1.0, 50, 0, requested_times=None)
 
 
 @pytest.mark.slow
@@ -78,10 +78,10 @@ def test_draws_of_many_steps_at_the_data_have_the_reported_moments():
 @pytest.mark.parametrize("variance", [0.0, 1e-10, 1.0, 1e6])
 @pytest.mark.parametrize("genes", [1, 3, 5])
 def test_draws_of_many_settings_have_the_reported_moments(genes, variance, steps, iterations):
-    for at in (AT, None):
-        check(softplus, genes, variance, steps, iterations, at)
+    for requested_times in (AT, None):
+        check(softplus, genes, variance, steps, iterations, requested_times)
         if iterations == 0:
-            check(identity, genes, variance, steps, iterations, at)
+            check(identity, genes, variance, steps, iterations, requested_times)
 
 
 @pytest.mark.slow
@@ -94,7 +94,7 @@ def test_draws_of_every_model_file_have_the_reported_moments(name):
     values = {key: jnp.asarray(value) for key, value in data.truth["parameters"].items()}
     seeded = seed(condition(file.model, values), jax.random.key(0))
     sites = trace(seeded).get_trace(data.times, data.y, **file.keywords(data, {}))
-    (site,) = [one for one in sites.values() if isinstance(one.get("fn"), lfm.MarginalLikelihood)]
+    (site,) = [candidate for candidate in sites.values() if isinstance(candidate.get("fn"), lfm.MarginalLikelihood)]
     end = data.times[-1] + 0.1 * (data.times[-1] - data.times[0])
     assert_draws_have_the_moments_of(site["fn"].smooth(data.y, at=np.linspace(data.times[0], end, 12)))
 
@@ -102,14 +102,14 @@ def test_draws_of_every_model_file_have_the_reported_moments(name):
 def test_requested_times_share_the_steps_of_an_interval():
     ssm = state_space(motif(softplus))
 
-    def steps_at(at, max_step=None):
-        grid = build_time_grid(ssm, TIMES, 12, max_step, at)
+    def steps_at(requested_times, max_step=None):
+        grid = build_time_grid(ssm, TIMES, 12, max_step, requested_times)
         return len(grid.intervals.length) * grid.steps, np.max(grid.intervals.length) / grid.steps
 
-    whole, longest = steps_at(None)
-    for at in (np.linspace(0.0, 14.0, 141), np.linspace(0.0, 14.0, 29), np.array([1.0])):
-        count, step = steps_at(at)
-        assert step <= longest * (1 + 1e-12) and count <= 2 * whole + 13 * len(at)
+    plain_count, longest = steps_at(None)
+    for requested_times in (np.linspace(0.0, 14.0, 141), np.linspace(0.0, 14.0, 29), np.array([1.0])):
+        count, step = steps_at(requested_times)
+        assert step <= longest * (1 + 1e-12) and count <= 2 * plain_count + 13 * len(requested_times)
     assert steps_at(np.linspace(0.0, 14.0, 57), max_step=0.05)[1] <= 0.05 * (1 + 1e-12)
     assert steps_at(np.array([300.0]))[1] <= longest, "a forecast takes steps of the usual length"
 
@@ -118,13 +118,14 @@ def test_requested_times_share_the_steps_of_an_interval():
 @pytest.mark.parametrize("iterations", [0, 3])
 def test_requested_times_move_the_moments_by_the_integration_error(iterations):
     """The error of an interval that is divided is that of its steps, of fourth order."""
-    model, y, at = motif(softplus, genes=2, noise_sd=0.0682), observed(2, softplus), np.array([0.5, 3.1, 9.3])
+    model, y = motif(softplus, genes=2, noise_sd=0.0682), observed(2, softplus)
+    requested_times = np.array([0.5, 3.1, 9.3])
 
     def difference(steps):
         plain = lfm.smooth(model, TIMES, y, steps=steps, iterations=iterations)
-        divided = lfm.smooth(model, TIMES, y, steps=steps, iterations=iterations, at=np.append(at, TIMES))
+        divided = lfm.smooth(model, TIMES, y, steps=steps, iterations=iterations, at=np.append(requested_times, TIMES))
         sd = np.sqrt(np.diagonal(plain.covariance, axis1=1, axis2=2))
-        change = np.abs(divided.mean[len(at):] - plain.mean)
+        change = np.abs(divided.mean[len(requested_times):] - plain.mean)
         assert change[sd < 1e-9].max(initial=0.0) < 1e-9
         return (change[sd > 1e-9] / sd[sd > 1e-9]).max()
 

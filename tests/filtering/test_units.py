@@ -59,11 +59,11 @@ class Distance(eqx.Module):
         return self.units.distance * jnp.sqrt(30e3**2 + (30.0 - x[:1] / self.units.altitude) ** 2)
 
 
-def target(units, known=False):
+def target(units, is_known=False):
     """The target, in any units."""
     units = Units(*map(jnp.asarray, units))  # arrays: other units compile nothing new
     scale = units.state
-    spread = np.zeros(2) if known else np.array([500.0, 100.0])
+    spread = np.zeros(2) if is_known else np.array([500.0, 100.0])
     return lfm.LatentForceModel(
         Fall(units), {"u": lfm.Matern(50.0 * units.force, 5.0 * units.time, order=2)},
         lfm.GaussianObservation(Distance(units), jnp.array([(30.0 * units.distance) ** 2])),
@@ -74,17 +74,17 @@ def target(units, known=False):
 @functools.cache
 def observations():
     """Distances in metres, one of them missing."""
-    simulated = lfm.simulate(jax.random.key(0), target(METRIC, known=True), np.append(0.0, TIMES), steps=5)
+    simulated = lfm.simulate(jax.random.key(0), target(METRIC, is_known=True), np.append(0.0, TIMES), steps=5)
     result = np.array(simulated.y)[1:]
     result[7] = np.nan
     return result
 
 
 @functools.cache
-def smoothed(units, known, iterations):
+def smoothed(units, is_known, iterations):
     """Means, covariances, leave-one-out and one-step-ahead densities in metres and seconds."""
-    y, at = observations(), np.linspace(0.0, 21.0, 30)
-    result = lfm.smooth(target(units, known), TIMES * units.time, y * units.distance, steps=4, at=at * units.time,
+    y, grid = observations(), np.linspace(0.0, 21.0, 30)
+    result = lfm.smooth(target(units, is_known), TIMES * units.time, y * units.distance, steps=4, at=grid * units.time,
                        iterations=iterations)
     scale = np.append(units.state, units.force)
     unit = np.isfinite(y[:, 0]) * np.log(units.distance)
@@ -94,16 +94,16 @@ def smoothed(units, known, iterations):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("units", OTHERS.values(), ids=OTHERS)
-@pytest.mark.parametrize("known, iterations", [
+@pytest.mark.parametrize("is_known, iterations", [
     (True, 0), pytest.param(False, 0, marks=pytest.mark.slow), pytest.param(False, 2, marks=pytest.mark.slow)])
-def test_smoothed_moments_are_those_in_other_units(known, iterations, units):
-    mean, covariance, *densities = smoothed(METRIC, known, iterations)
-    other_mean, other_covariance, *others = smoothed(units, known, iterations)
+def test_smoothed_moments_are_those_in_other_units(is_known, iterations, units):
+    mean, covariance, *densities = smoothed(METRIC, is_known, iterations)
+    other_mean, other_covariance, *other_densities = smoothed(units, is_known, iterations)
     sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
     unit = np.where(sd > 0, sd, 1.0)
     assert np.max(np.abs(other_mean - mean) / unit) < 1e-8
     assert np.max(np.abs(other_covariance - covariance) / (unit[:, :, None] * unit[:, None, :])) < 1e-8
-    np.testing.assert_allclose(others, densities, atol=1e-8)
+    np.testing.assert_allclose(other_densities, densities, atol=1e-8)
 
 
 @jax.jit

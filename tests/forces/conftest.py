@@ -40,8 +40,8 @@ FORCES = {
         PeriodicMatern(s, 1.2, 9.0 * ell), Matern(1.0, 5.0 * ell), functions=3, explained_variance=0.0),
     "quasi_periodic_steps": lambda s, ell: QuasiPeriodic(
         PeriodicSquaredExponential(s, 1.2, 9.0 * ell), SQM(2.0, (1.0, 3.0)), functions=3, explained_variance=0.0),
-    "oscillator": lambda s, ell: Oscillator(s, ell),
-    "jumping_sum": lambda s, ell: Oscillator(s, ell, (1.0, 3.0)) + Matern(s, ell),
+    "oscillator": lambda s, ell: MinimalOscillator(s, ell),
+    "jumping_sum": lambda s, ell: MinimalOscillator(s, ell, (1.0, 3.0)) + Matern(s, ell),
     "shared_matern": lambda s, ell: in_state_of(Matern(s, ell, 2), Matern(1.0, 0.3 * ell, 2)),
     "shared_squared_exponential": lambda s, ell: in_state_of(
         SquaredExponential(s, ell, order=4), SquaredExponential(1.0, 2.0 * ell, order=4)),
@@ -59,7 +59,7 @@ def params(quick):
     return [pytest.param(name, marks=() if name in quick else pytest.mark.slow) for name in FORCES]
 
 
-class Oscillator(Force):
+class MinimalOscillator(Force):
     """A critically damped oscillator that says the least possible, so that the defaults are used.
 
     The state (u, u'/w) has the stationary covariance scale^2 I. At each jump the velocity turns
@@ -125,7 +125,7 @@ def build_to_differentiate(request):
 
 @pytest.fixture
 def oscillator():
-    return Oscillator
+    return MinimalOscillator
 
 
 @pytest.fixture

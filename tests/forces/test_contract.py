@@ -38,7 +38,7 @@ def test_every_public_force_is_in_the_list(every_force):
 
 
 def test_state_space_form(build, exact_step):
-    """Shapes; steps are those of the Taylor series in high precision, also none or two of them; the noise is definite.
+    """Shapes; steps equal the Taylor series in high precision, also none or two of them; the noise is definite.
 
     A stationary covariance stays what it is.
     """
@@ -65,8 +65,8 @@ def test_state_space_form(build, exact_step):
     assert_array_equal(transition, np.eye(n))
     assert_array_equal(noise, np.zeros((n, n)))
     for first, second in ((1e-6, 1e-7), (0.3, 0.4), (0.5, 40.0)):
-        (a, b, whole), (qa, qb, q) = steps(force, np.array([first, second, first + second]))
-        assert_allclose(b @ a, whole, atol=1e-13 * max(1.0, np.abs(whole).max()))
+        (a, b, full_step), (qa, qb, q) = steps(force, np.array([first, second, first + second]))
+        assert_allclose(b @ a, full_step, atol=1e-13 * max(1.0, np.abs(full_step).max()))
         assert entrywise_error(b @ qa @ b.T + qb, q) < 1e-12
     for lengthscale in EXTREME_LENGTHSCALES:
         transition, noise = map(np.asarray, steps(build(SCALE, lengthscale), lengthscale * np.logspace(-8, 6, 57)))
@@ -82,7 +82,7 @@ def test_state_space_form(build, exact_step):
 
 
 def test_derivatives(build_to_differentiate):
-    """In both modes: finite everywhere, and those of differences where these are accurate."""
+    """In both modes: finite everywhere, and equal to differences where these are accurate."""
     build = build_to_differentiate
 
     def parts(point):
@@ -105,8 +105,8 @@ def test_derivatives(build_to_differentiate):
         assert_allclose(value[:4], expected, rtol=1e-12, atol=1e-14)
     for gradient, backward, value in zip(forward[:2], reverse[:2], values[:2], strict=True):
         assert_allclose(gradient[:4], backward[:4], rtol=1e-12, atol=1e-14)
-        for i, (ahead, behind) in enumerate(value[-24:].reshape(3, 2, *gradient[:4].shape[:-1])):
-            assert_allclose(gradient[:4, ..., i], (ahead - behind) / (2 * h), rtol=1e-6, atol=3e-7)
+        for i, (upper, lower) in enumerate(value[-24:].reshape(3, 2, *gradient[:4].shape[:-1])):
+            assert_allclose(gradient[:4, ..., i], (upper - lower) / (2 * h), rtol=1e-6, atol=3e-7)
 
 
 def test_covariance_of_the_sde_is_the_closed_form(build, has_exact_covariance):

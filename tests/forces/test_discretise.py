@@ -29,9 +29,9 @@ SYSTEMS = {
 def test_chain_of_integrators(n):
     """Nilpotent; the last of n integrators in a row is driven by Brownian motion."""
     feedback, column = np.diag(np.ones(n - 1), 1), np.eye(n)[:, -1:]
-    back, order = np.arange(n)[::-1], np.arange(n)[None, :] - np.arange(n)[:, None]
-    weight = np.array([factorial(k) for k in back])
-    power = back[:, None] + back + 1
+    exponents, order = np.arange(n)[::-1], np.arange(n)[None, :] - np.arange(n)[:, None]
+    weight = np.array([factorial(k) for k in exponents])
+    power = exponents[:, None] + exponents + 1
     for dt in (1e-8, 0.3, 1.0, 1e6):
         transition, noise = step(feedback, column @ column.T, dt)
         assert_allclose(noise, dt ** power.astype(float) / power / np.outer(weight, weight), rtol=1e-13)
@@ -40,7 +40,7 @@ def test_chain_of_integrators(n):
 
 
 @jax.jit
-def both(feedback, column):
+def discretise_both(feedback, column):
     return jax.vmap(lambda dt: (discretise(feedback, column @ column.T, dt),
                                 discretise_dispersion(feedback, column, dt)))(DTS)
 
@@ -49,7 +49,7 @@ def both(feedback, column):
 def test_equals_the_taylor_series_in_high_precision(name, exact_step):
     feedback = SYSTEMS[name]
     column = np.linspace(1.0, 0.0, len(feedback))[::-1, None]
-    for transitions, noises in both(feedback, column):
+    for transitions, noises in discretise_both(feedback, column):
         for dt, transition, noise in zip(DTS, transitions, noises, strict=True):
             expected_transition, expected = exact_step(feedback, column, dt)
             sd = np.sqrt(np.diag(expected))
@@ -188,7 +188,7 @@ phi = jax.jit(phi_functions)
 
 
 def test_phi_functions_of_fast_decays():
-    """They tend to 1/z, 1/z and 1/(2 z); the derivatives are those of differences."""
+    """They tend to 1/z, 1/z and 1/(2 z); the derivatives equal differences."""
     rates = np.array([1e4, 1e9, 1e15, 1e30])
     values = jax.jit(jax.vmap(phi_functions))(-rates[:, None, None])[:, :, 0, 0]
     expected = np.stack([0 * rates, 1 / rates, (1 - 1 / rates) / rates, (0.5 - (1 - 1 / rates) / rates) / rates], 1)

@@ -37,8 +37,8 @@ def test_kernels_are_the_published_ones():
         expected = 1.5**2 * polynomial(x) * np.exp(-x)
         assert_allclose(forces.PeriodicMatern(1.5, 0.7, 10.0, order)(LAG + 3.0, 3.0), expected, rtol=1e-11)
         moderated = forces.ModeratedPeriodicMatern(1.5, 0.7, 10.0, 0.3, order)
-        near = np.abs(LAG - 10 * np.round(LAG / 10))
-        assert_allclose(moderated(LAG, 0.0), expected * np.exp(-0.3 * near), rtol=1e-11)
+        distance = np.abs(LAG - 10 * np.round(LAG / 10))
+        assert_allclose(moderated(LAG, 0.0), expected * np.exp(-0.3 * distance), rtol=1e-11)
         assert_allclose(moderated(LAG + 10.0, 3.0), moderated(LAG, -7.0), rtol=1e-11)
 
 
@@ -112,18 +112,18 @@ def test_nystrom_is_the_paper_s_formula():
     """Equation 30, orthonormal eigenfunctions, and a mean error of the eigenvalues left out."""
     kernel, count = forces.ModeratedPeriodicMatern(1.2, 0.8, 10.0, 0.2, 1), 7
     force = lfm.Periodic(kernel, functions=count, points=100)
-    at = np.asarray(force.basis.points)
-    gram = np.asarray(kernel(at[:, None], at[None, :]))
+    points = np.asarray(force.basis.points)
+    gram = np.asarray(kernel(points[:, None], points[None, :]))
     values, vectors = np.linalg.eigh(gram)
     values, vectors = values[::-1], vectors[:, ::-1]
     t = np.array([0.3, 4.4, 9.9, 13.0])
-    phi = np.sqrt(100) / values[:count] * (np.asarray(kernel(t[:, None], at)) @ vectors[:, :count])
+    phi = np.sqrt(100) / values[:count] * (np.asarray(kernel(t[:, None], points)) @ vectors[:, :count])
     assert_allclose(force.sde_covariance(t[:, None], t), phi * values[:count] / 100 @ phi.T, atol=1e-12)
     assert_allclose(force.eigenvalues(), values[:count] / 100, rtol=1e-10)
     assert_allclose(np.abs(force.eigenfunctions(t)), np.abs(phi), atol=1e-9)
-    on_grid = np.asarray(force.eigenfunctions(at))
+    on_grid = np.asarray(force.eigenfunctions(points))
     assert_allclose(on_grid.T @ on_grid / 100, np.eye(count), atol=1e-10)
-    error = np.diag(gram) - np.asarray(force.sde_covariance(at, at))
+    error = np.diag(gram) - np.asarray(force.sde_covariance(points, points))
     assert (error > -1e-12).all()
     assert error.mean() == pytest.approx(values[count:].sum() / 100, rel=1e-9)
     assert significant_functions(kernel) == (values > 0.01 * values[0]).sum()
@@ -131,11 +131,12 @@ def test_nystrom_is_the_paper_s_formula():
 
 def test_both_treatments_agree_where_both_apply():
     kernel = squared_exponential(0.8)
-    other = forces.PeriodicKernel(lambda t, s: jnp.exp(-(jnp.sin(jnp.pi * (t - s) / 10.0) / 0.8) ** 2), 10.0)
-    said = forces.PeriodicKernel(other.function, 10.0, stationary=True, start=2.0)
-    one, two, three = (lfm.Periodic(k, functions=9).sde_covariance(LAG, 1.7) for k in (kernel, other, said))
-    assert_allclose(two, one, atol=1e-9)
-    assert_allclose(three, one, atol=1e-12)
+    general = forces.PeriodicKernel(lambda t, s: jnp.exp(-(jnp.sin(jnp.pi * (t - s) / 10.0) / 0.8) ** 2), 10.0)
+    stationary = forces.PeriodicKernel(general.function, 10.0, stationary=True, start=2.0)
+    first, second, third = (lfm.Periodic(k, functions=9).sde_covariance(LAG, 1.7)
+                            for k in (kernel, general, stationary))
+    assert_allclose(second, first, atol=1e-9)
+    assert_allclose(third, first, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -224,14 +225,14 @@ def test_simulated_weights_have_the_published_covariance(evolution):
     t, draws = np.array([3.0, 8.0, 20.0, 22.0, 37.0]), 20_000
     model = lfm.LatentForceModel(lambda x, u, t: x, {"a": evolution}, lfm.GaussianObservation(
         lambda x, u, t: u, jnp.array([1e-12])), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))), initial_time=0.0)
-    drawn = np.asarray(jax.jit(jax.vmap(lambda key: lfm.simulate(key, model, t, steps=2).forces["a"]))(
+    weights = np.asarray(jax.jit(jax.vmap(lambda key: lfm.simulate(key, model, t, steps=2).forces["a"]))(
         jax.random.split(jax.random.key(0), draws)))
     cycle = np.array([0, 0, 2, 2, 3])  # a change point at an observation comes before it
     later, earlier = np.maximum(*np.meshgrid(cycle, cycle)), np.minimum(*np.meshgrid(cycle, cycle))
     exact = {"CQM": np.exp(-np.abs(t[:, None] - t) / 12.0), "SQM": np.exp(-(later - earlier) / 1.5),
              "WQM": 1.0 + 0.4 * earlier}[type(evolution).__name__]
     assert_allclose(evolution.covariance(t[:, None], t), exact, rtol=1e-12)
-    result = drawn.T @ drawn / draws
+    result = weights.T @ weights / draws
     error = np.sqrt((np.outer(np.diag(exact), np.diag(exact)) + exact**2) / draws)
     assert (np.abs(result - exact) < 4 * error).all()
 
@@ -267,10 +268,13 @@ def test_resonators_carry_the_kernel():
     assert_allclose(result.covariance(LAG[:, None], LAG), exact, atol=1e-12)
     assert [float(force.period) for force in result.forces[1:]] == [24.0, 12.0, 8.0, 6.0]
     assert float(result.mean_at(5.0)) == 2.0
-    moving = resonators(kernel, functions=3, noise=0.1, damping=0.02)
-    scale = float(moving.forces[1].scale)
-    assert float(moving.forces[1].noise) == pytest.approx(0.1 * scale) and float(moving.forces[1].damping) == 0.02
-    kernel = lambda p: forces.PeriodicMatern(1.0, 0.7, p)  # noqa: E731
+    noisy = resonators(kernel, functions=3, noise=0.1, damping=0.02)
+    scale = float(noisy.forces[1].scale)
+    assert float(noisy.forces[1].noise) == pytest.approx(0.1 * scale) and float(noisy.forces[1].damping) == 0.02
+
+    def kernel(p):
+        return forces.PeriodicMatern(1.0, 0.7, p)
+
     gradient = jax.grad(lambda p: resonators(kernel(p), functions=5).covariance(7.0))(24.0)
     expected = jax.grad(lambda p: lfm.Periodic(kernel(p), functions=5).sde_covariance(7.0))(24.0)
     assert float(gradient) == pytest.approx(float(expected), rel=1e-10)
@@ -307,7 +311,10 @@ def test_a_kernel_that_is_not_positive_definite_is_named():
         for options in ({}, {"functions": 9}):
             with pytest.raises(ValueError, match="'box'"):
                 lfm.Periodic(forces.PeriodicKernel(box, 5.0, stationary=stationary), **options)
-    kernel = lambda p: forces.PeriodicKernel(box, p, stationary=True)  # noqa: E731
+
+    def kernel(p):
+        return forces.PeriodicKernel(box, p, stationary=True)
+
     assert np.isnan(jax.jit(lambda p: lfm.Periodic(kernel(p), functions=9).eigenvalues())(5.0)).any()
-    inside = jax.jit(lambda ell: forces.SQM(ell, forces.change_points(24.0, 0.0, 50.0)).covariance(0.0, 49.0))
-    assert float(inside(2.0)) == pytest.approx(np.exp(-1.0))
+    covariance = jax.jit(lambda ell: forces.SQM(ell, forces.change_points(24.0, 0.0, 50.0)).covariance(0.0, 49.0))
+    assert float(covariance(2.0)) == pytest.approx(np.exp(-1.0))

@@ -22,7 +22,7 @@ def rational(order, parameters, omega):
     """S_n / S(0) in units of the lengthscale, from the logarithms of its parameters.
 
     They are the gain, c of a factor 1 + c y of the denominator if the order is odd, y = omega^2, and (w^2, c) of each
-    of its factors (1 - y / w^2)^2 + c y, then of those of the numerator: all positive polynomials.
+    of its factors (1 - y / w^2)^2 + c y, then of the factors of the numerator: all positive polynomials.
     """
     y = np.asarray(omega) ** 2
     odd = order % 2
@@ -110,17 +110,17 @@ def test_the_constants_are_those_of_the_fit(order):
 @pytest.mark.thorough
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_constants_are_optimal(order):
-    delta, at = _FITS[order].delta, stored(order)
-    cost = (residuals(order, delta, at) ** 2).sum()
-    for index in np.flatnonzero(np.isfinite(at)):
-        shifted = [at + step * np.eye(at.size)[index] for step in (1e-4, -1e-4)]
-        assert min((residuals(order, delta, np.where(np.isfinite(at), p, at)) ** 2).sum() for p in shifted) > cost
+    delta, theta = _FITS[order].delta, stored(order)
+    cost = (residuals(order, delta, theta) ** 2).sum()
+    for index in np.flatnonzero(np.isfinite(theta)):
+        shifted = [theta + step * np.eye(theta.size)[index] for step in (1e-4, -1e-4)]
+        assert min((residuals(order, delta, np.where(np.isfinite(theta), p, theta)) ** 2).sum() for p in shifted) > cost
 
 
 @pytest.mark.parametrize(("order", "covariance_error", "density_error"), [
     (2, 0.055, 0.18), (4, 0.0124, 0.026), (6, 0.0094, 0.0195), (7, 0.002, 0.0042), (8, 2.2e-4, 4.5e-4)])
 def test_density_and_covariance_of_the_sde(order, covariance_error, density_error):
-    """They are the rational density and its transform, and as far from those of the force as documented."""
+    """They are the rational density and its transform, and as far from the force's own as documented."""
     scale, ell = 1.3, 0.7
     force = lfm.SquaredExponential(scale, ell, order)
     omega = np.array([0.0, 0.3, 1.0, 3.0, 4.9, 9.0, 30.0])

@@ -85,26 +85,26 @@ def state_state(t, s, decay_t, decay_s, lengthscale):
                                                                                   lengthscale), s, t)
 
 
-def joint_covariance(times, at, decay, lengthscale):
-    """Covariance of (x(times) (T, M) flattened, u(at) (K,), x(at) (K, M) flattened), times and at from zero."""
+def joint_covariance(times, grid, decay, lengthscale):
+    """Covariance of x(times) (T, M), u(grid) (K,) and x(grid) (K, M), flattened; times and grid from zero."""
     size = len(decay)
-    everywhere = np.concatenate([times, at])
-    labels = [("x", t, j) for t in times for j in range(size)] + [("u", t, 0) for t in at]
-    labels += [("x", t, j) for t in at for j in range(size)]
+    everywhere = np.concatenate([times, grid])
+    labels = [("x", t, j) for t in times for j in range(size)] + [("u", t, 0) for t in grid]
+    labels += [("x", t, j) for t in grid for j in range(size)]
     xx = np.array([[SENSITIVITY[i] * SENSITIVITY[j] * state_state(everywhere[:, None], everywhere, decay[i], decay[j],
                                                                   lengthscale) for j in range(size)]
                    for i in range(size)])
     for j in range(size):
         xx[j, j] += START_VARIANCE * np.exp(-decay[j] * (everywhere[:, None] + everywhere))
-    xu = np.array([SENSITIVITY[j] * state_force(everywhere[:, None], at, decay[j], lengthscale) for j in range(size)])
-    index = np.concatenate([np.repeat(np.arange(len(times)), size), np.arange(len(at)),
-                            np.repeat(len(times) + np.arange(len(at)), size)])
+    xu = np.array([SENSITIVITY[j] * state_force(everywhere[:, None], grid, decay[j], lengthscale) for j in range(size)])
+    index = np.concatenate([np.repeat(np.arange(len(times)), size), np.arange(len(grid)),
+                            np.repeat(len(times) + np.arange(len(grid)), size)])
     covariance = np.empty((len(labels), len(labels)))
     for row, (kind, t, i) in enumerate(labels):
-        for column, (other, s, j) in enumerate(labels):
-            if kind == "x" and other == "x":
+        for column, (other_kind, s, j) in enumerate(labels):
+            if kind == "x" and other_kind == "x":
                 value = xx[i, j, index[row], index[column]]
-            elif kind == "u" and other == "u":
+            elif kind == "u" and other_kind == "u":
                 value = kernel(t - s, lengthscale)
             elif kind == "x":
                 value = xu[i, index[row], index[column]]
@@ -130,9 +130,9 @@ def log_density(y, decay, lengthscale, noise_sd, times=TIMES) -> float:
     return -0.5 * (white @ white + np.linalg.slogdet(covariance)[1] + present.sum() * np.log(2 * np.pi))
 
 
-def posterior(y, at, decay, lengthscale, noise_sd, times=TIMES):
-    """Exact mean and covariance of (x(times) flattened, u(at), x(at) flattened) given ``y``."""
-    joint = joint_covariance(times, at, decay, lengthscale)
+def posterior(y, grid, decay, lengthscale, noise_sd, times=TIMES):
+    """Exact mean and covariance of (x(times) flattened, u(grid), x(grid) flattened) given ``y``."""
+    joint = joint_covariance(times, grid, decay, lengthscale)
     present = np.flatnonzero(np.isfinite(y).ravel())
     observed = joint[np.ix_(present, present)] + noise_sd**2 * np.eye(len(present))
     gain = np.linalg.solve(observed, joint[present]).T

@@ -67,10 +67,10 @@ def test_coordinates_are_named_and_values_come_back(bound):
     assert bound.names == ("decay", "lengthscale", "noise_sd[0]", "noise_sd[1]")
     assert bound.size == 4 and "decay" in repr(bound)
     z = bound.unconstrain(VALUES)
-    back = bound.constrain(z)
-    assert float(back["half_life"]) == pytest.approx(np.log(2.0) / 0.8)
+    parameters = bound.constrain(z)
+    assert float(parameters["half_life"]) == pytest.approx(np.log(2.0) / 0.8)
     for name, value in VALUES.items():
-        np.testing.assert_allclose(back[name], value, rtol=1e-12)
+        np.testing.assert_allclose(parameters[name], value, rtol=1e-12)
     several = bound.constrain_draws(np.stack([z, z + 0.1])[None])
     assert several["noise_sd"].shape == (1, 2, 2) and several["half_life"].shape == (1, 2)
     np.testing.assert_allclose(several["noise_sd"][0, 0], VALUES["noise_sd"], rtol=1e-12)
@@ -93,8 +93,8 @@ def test_the_density_is_numpyros_and_its_gradient_agrees_with_differences(bound)
 
 def test_many_data_sets_are_a_vmap():
     bound, z = lfm.bind(small, TIMES, Y), np.array([0.1])
-    both = jax.vmap(bound.log_density, in_axes=(None, 0))(z, jnp.stack([jnp.asarray(Y), jnp.asarray(OTHER)]))
-    np.testing.assert_allclose(both, [bound.log_density(z), bound.log_density(z, OTHER)], rtol=1e-12)
+    densities = jax.vmap(bound.log_density, in_axes=(None, 0))(z, jnp.stack([jnp.asarray(Y), jnp.asarray(OTHER)]))
+    np.testing.assert_allclose(densities, [bound.log_density(z), bound.log_density(z, OTHER)], rtol=1e-12)
 
 
 @pytest.mark.thorough
@@ -110,8 +110,9 @@ def test_filter_and_smoother_at_a_draw_are_the_librarys_at_times_that_the_model_
     for point in (z, values):
         np.testing.assert_allclose(bound.filter(point).filtered_mean, expected.filtered_mean, atol=1e-10)
     assert float(expected.log_likelihood.sum()) == pytest.approx(float(bound.log_likelihood(z)), rel=1e-10)
-    at = [0.5, 7.0]  # requested times need known ones
-    smoothed, force = lfm.smooth(system, 2.0 * TIMES, OTHER, steps=2, at=at), bound.smooth(z, at, OTHER).force("u")
+    requested_times = [0.5, 7.0]  # requested times need known ones
+    smoothed = lfm.smooth(system, 2.0 * TIMES, OTHER, steps=2, at=requested_times)
+    force = bound.smooth(z, requested_times, OTHER).force("u")
     np.testing.assert_allclose(force.mean, smoothed.force("u").mean, atol=1e-10)
     np.testing.assert_allclose(force.sd, smoothed.force("u").sd, atol=1e-10)
 
@@ -127,12 +128,12 @@ def test_the_methods_of_a_bound_model_read_the_model_once():
     first.log_density(z)
     count = run.call_count
     with compilations() as compiled:
-        other = first.with_data(OTHER)
-        other.log_density_gradient(z)
-        other.log_density(z)
+        with_other_data = first.with_data(OTHER)
+        with_other_data.log_density_gradient(z)
+        with_other_data.log_density(z)
         assert run.call_count == count
         second = lfm.bind(counted, TIMES.copy(), OTHER)
-        assert float(second.log_density(z)) == float(other.log_density(z)) != float(first.log_density(z))
+        assert float(second.log_density(z)) == float(with_other_data.log_density(z)) != float(first.log_density(z))
     assert compiled == []
 
 
@@ -186,9 +187,9 @@ def test_a_step_is_that_of_numpyros_nuts(model):
         moved += int(mine.hmc.num_steps) > 1 and not np.array_equal(mine.z["decay"], state.z["decay"])
         for name in mine.z:
             np.testing.assert_allclose(mine.z[name], theirs.z[name], rtol=1e-6)
-        for one, other in zip(jax.tree.leaves(mine.hmc.adapt_state.inverse_mass_matrix),
-                              jax.tree.leaves(theirs.adapt_state.inverse_mass_matrix), strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-6)
+        for matrix, expected_matrix in zip(jax.tree.leaves(mine.hmc.adapt_state.inverse_mass_matrix),
+                                           jax.tree.leaves(theirs.adapt_state.inverse_mass_matrix), strict=True):
+            np.testing.assert_allclose(matrix, expected_matrix, rtol=1e-6)
         np.testing.assert_allclose(mine.hmc.adapt_state.step_size, theirs.adapt_state.step_size, rtol=1e-6)
         state = mine
     assert moved >= 3
@@ -280,11 +281,11 @@ def test_a_panel():
             numpyro.sample("y", lfm.panel(lambda p: systems.motif(systems.identity, decay=p), decay * jnp.ones(2),
                                           times, steps=2), obs=y)
 
-    both = np.stack([Y, OTHER])
-    result = lfm.bind(several, TIMES, both)
+    panel_data = np.stack([Y, OTHER])
+    result = lfm.bind(several, TIMES, panel_data)
     z = np.array([0.1])
     system = systems.motif(systems.identity, decay=np.exp(0.1))
-    parts = [lfm.MarginalLikelihood(system, TIMES, steps=2).log_prob(y) for y in both]
+    parts = [lfm.MarginalLikelihood(system, TIMES, steps=2).log_prob(y) for y in panel_data]
     assert float(result.log_likelihood(z)) == pytest.approx(float(sum(parts)), rel=1e-10)
     with pytest.raises(ValueError, match="one series"):
         result.smooth(z)
@@ -350,14 +351,14 @@ def test_a_model_is_what_its_function_computes_now(kind, monkeypatch):
         fitted = lfm.fit(current, TIMES, Y, sampler="map", samples=50, trajectory_draws=0, progress=False)
         return float(bound.log_density(np.array([0.1]))), model_digest(bound), float(fitted["posterior"]["decay"].std())
 
-    before = compute()
+    initial_values = compute()
     with compilations() as compiled:
-        assert compute() == before
+        assert compute() == initial_values
     assert compiled == []
     change()
-    after = compute()
-    assert all(new != old for new, old in zip(after, before, strict=True))
-    assert after[0] == pytest.approx(numpyro_density(current, (TIMES, Y), {"decay": 0.1}), rel=1e-12)
+    changed_values = compute()
+    assert all(new != old for new, old in zip(changed_values, initial_values, strict=True))
+    assert changed_values[0] == pytest.approx(numpyro_density(current, (TIMES, Y), {"decay": 0.1}), rel=1e-12)
 
 
 def test_a_digest_tells_models_that_need_the_values_of_their_data_apart():
@@ -402,10 +403,10 @@ def test_a_model_may_be_bound_first_in_compiled_code():
         small(times, y, order=0)
 
     z = np.zeros(1)
-    inside = jax.jit(lambda z: lfm.bind(prior, TIMES, Y).log_prior(z))(z)
+    compiled_value = jax.jit(lambda z: lfm.bind(prior, TIMES, Y).log_prior(z))(z)
     with_data = jax.jit(lambda z, y: lfm.bind(prior, TIMES, y).log_prior(z))(z, Y)
-    outside = lfm.bind(prior, TIMES, Y).log_prior(z)
-    np.testing.assert_allclose([inside, with_data], outside, rtol=1e-12)
+    eager_value = lfm.bind(prior, TIMES, Y).log_prior(z)
+    np.testing.assert_allclose([compiled_value, with_data], eager_value, rtol=1e-12)
 
 
 def no_site(times, y=None):
@@ -447,10 +448,13 @@ def test_observations_of_one_output_may_be_a_vector():
 
 def test_fixing_in_compiled_code_leaves_nothing_behind(bound):
     values, z = {"decay": 0.8, "noise_sd": 0.1}, np.array([0.2])
-    inside = jax.jit(lambda z: bound.fix(values).log_prior(z))(z)
-    assert float(bound.fix(values).log_prior(z)) == pytest.approx(float(inside), rel=1e-12)
-    at = lambda decay: bound.fix({**values, "decay": decay}).log_prior(z)  # noqa: E731
-    assert np.isfinite(jax.jit(at)(0.8)) and np.isfinite(jax.grad(at)(0.8))
+    compiled_value = jax.jit(lambda z: bound.fix(values).log_prior(z))(z)
+    assert float(bound.fix(values).log_prior(z)) == pytest.approx(float(compiled_value), rel=1e-12)
+
+    def prior_at(decay):
+        return bound.fix({**values, "decay": decay}).log_prior(z)
+
+    assert np.isfinite(jax.jit(prior_at)(0.8)) and np.isfinite(jax.grad(prior_at)(0.8))
 
 
 @pytest.mark.slow

@@ -50,17 +50,17 @@ def test_a_step_leaves_the_target_as_it_is():
     density = np.exp(peaks(GRID) - 0.5 * ((GRID - MEAN) / SD) ** 2)
     cumulative = np.cumsum(density) / density.sum()
     size = 40_000
-    before = np.interp(np.random.default_rng(0).uniform(size=size), cumulative, GRID)
-    state = SliceState(jnp.asarray(before), peaks(before), np.zeros(size, int))
-    after = jax.vmap(step)(jax.random.split(jax.random.key(1), size), state)
-    x = np.asarray(after.position)
-    assert np.mean(x != before) == 1.0
-    assert kstest(before, lambda q: np.interp(q, GRID, cumulative)).pvalue > 1e-3
+    positions = np.interp(np.random.default_rng(0).uniform(size=size), cumulative, GRID)
+    state = SliceState(jnp.asarray(positions), peaks(positions), np.zeros(size, int))
+    new_state = jax.vmap(step)(jax.random.split(jax.random.key(1), size), state)
+    x = np.asarray(new_state.position)
+    assert np.mean(x != positions) == 1.0
+    assert kstest(positions, lambda q: np.interp(q, GRID, cumulative)).pvalue > 1e-3
     assert kstest(x, lambda q: np.interp(q, GRID, cumulative)).pvalue > 1e-3
-    np.testing.assert_allclose(after.log_likelihood, peaks(x), rtol=1e-9, atol=1e-12)
-    # The step is reversible: (before, after) and (after, before) have the same distribution.
+    np.testing.assert_allclose(new_state.log_likelihood, peaks(x), rtol=1e-9, atol=1e-12)
+    # The step is reversible: (old, new) and (new, old) positions have the same distribution.
     for f, g in ((np.sign, np.abs), (np.sin, np.exp), (lambda q: q, lambda q: q**3)):
-        difference = f(before) * g(x) - g(before) * f(x)
+        difference = f(positions) * g(x) - g(positions) * f(x)
         assert abs(difference.mean()) < 4 * difference.std() / math.sqrt(size)
 
 
@@ -240,11 +240,11 @@ def test_agreement_with_blackjax():
     peer = blackjax.elliptical_slice(log_likelihood, mean=jnp.full(5, 0.5), cov=jnp.asarray(KERNEL))
 
     def chain(key):
-        def one(state, key):
+        def chain_step(state, key):
             state, _ = peer.step(key, state)
             return state, state.position
 
-        return jax.lax.scan(one, peer.init(jnp.full(5, 0.5)), jax.random.split(key, warmup + draws))[1][warmup:]
+        return jax.lax.scan(chain_step, peer.init(jnp.full(5, 0.5)), jax.random.split(key, warmup + draws))[1][warmup:]
 
     theirs = np.asarray(jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(3), chains)))
 
@@ -254,8 +254,8 @@ def test_agreement_with_blackjax():
     centre = theirs.mean(axis=(0, 1))
     for k in range(5):
         for function in (lambda f: f, lambda f: (f - centre[k]) ** 2):  # noqa: B023
-            (one, error), (other, other_error) = (mean_and_error(function(x[:, :, k])) for x in (ours, theirs))
-            assert abs(one - other) < 4 * math.hypot(error, other_error)
+            (mean, error), (peer_mean, peer_error) = (mean_and_error(function(x[:, :, k])) for x in (ours, theirs))
+            assert abs(mean - peer_mean) < 4 * math.hypot(error, peer_error)
         sds, errors = zip(*((x[:, :, k].std(), _error_of_sd(x[:, :, k])) for x in (ours, theirs)), strict=True)
         assert abs(sds[0] - sds[1]) < 4 * math.hypot(*errors)
 

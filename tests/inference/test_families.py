@@ -134,14 +134,14 @@ def test_nuts_with_expectation_propagation_is_calibrated(name, tmp_path):
     assert_uniform(result, bins=16)
 
 
-def densities(model, times, y, count, keywords=None, known=None, seed=0):
+def densities(model, times, y, count, keywords=None, fixed_values=None, seed=0):
     """Return draws of the prior, and the function from them to log densities and their gradients, in one program.
 
     One after the other: side by side all of them wait for the one whose factors take longest, with several times the
     memory.
     """
     keywords = keywords or {}
-    bound = bind(model, times, y, model_kwargs=keywords).fix(known or {})
+    bound = bind(model, times, y, model_kwargs=keywords).fix(fixed_values or {})
     prior = Predictive(handlers.block(model, hide=["y"]), num_samples=count)(jax.random.key(seed), times, y, **keywords)
     trace = handlers.trace(handlers.seed(model, 0)).get_trace(times, y, **keywords)
     draws = {name: biject_to(trace[name]["fn"].support).inv(prior[name]) for name in bound.sites}
@@ -191,14 +191,14 @@ def test_draws_of_the_prior_of_a_file_have_a_density_and_the_gradient_of_differe
     if name == "ginzburg-landau":
         return  # where another number of steps meets the tolerance, the density itself jumps by a little
     size = z.shape[1]
-    chosen = np.flatnonzero(np.isfinite(value))[:count // (4 * size)][:8]
+    indices = np.flatnonzero(np.isfinite(value))[:count // (4 * size)][:8]
     step = 1e-3 * np.array([1, -1, 2, -2])
-    points = (z[chosen, None, None] + step[:, None] * np.eye(size)[:, None, :]).reshape(-1, size)
+    points = (z[indices, None, None] + step[:, None] * np.eye(size)[:, None, :]).reshape(-1, size)
     padded = np.concatenate([points, np.repeat(z[:1], len(z) - len(points), axis=0)])
-    shifted = run(padded)[0][: len(points)].reshape(len(chosen), size, 4)
+    shifted = run(padded)[0][: len(points)].reshape(len(indices), size, 4)
     differences = (8 * (shifted[..., 0] - shifted[..., 1]) - (shifted[..., 2] - shifted[..., 3])) / 12e-3
-    scale = np.abs(gradient[chosen]).max(axis=1, keepdims=True)
-    np.testing.assert_array_less(np.abs(gradient[chosen] - differences) / scale, 1e-5)
+    scale = np.abs(gradient[indices]).max(axis=1, keepdims=True)
+    np.testing.assert_array_less(np.abs(gradient[indices] - differences) / scale, 1e-5)
 
 
 @pytest.mark.thorough

@@ -121,5 +121,5 @@ def test_mass_matrices_are_means_of_draws_and_approximation():
     expected = 29 * np.cov(draws.T) + weight * COVARIANCE + 30 * weight / count * np.outer(shift, shift)
     assert_allclose(sum_of_squares, expected, rtol=1e-12)
     # An estimate that has draws is left alone.
-    (again,) = nuts._with_pseudo_draws(state(estimate), laplace).adapt_state.mm_state.values()
-    assert_allclose(again[1], sum_of_squares)
+    (mass_state,) = nuts._with_pseudo_draws(state(estimate), laplace).adapt_state.mm_state.values()
+    assert_allclose(mass_state[1], sum_of_squares)

@@ -134,11 +134,15 @@ def test_a_panel():
     y = np.stack([Y, np.full_like(Y, np.nan)])
     settings = ParticleSettings(500)
     z = jnp.array([-0.3])
-    both = ParticlePotential(bind(panel, TIMES, y), settings)
-    one = ParticlePotential(bind(relaxing, TIMES, Y), settings)
-    run = lambda potential: jax.jit(jax.vmap(lambda key: potential(z, key)))(  # noqa: E731
-        jax.random.split(jax.random.key(3), 200))
-    mine, single = np.asarray(run(both)), np.asarray(run(one))  # a series that is all missing adds nothing
+    panel_potential = ParticlePotential(bind(panel, TIMES, y), settings)
+    single_potential = ParticlePotential(bind(relaxing, TIMES, Y), settings)
+
+    def run(potential):
+        return jax.jit(jax.vmap(lambda key: potential(z, key)))(
+            jax.random.split(jax.random.key(3), 200))
+
+    # A series that is all missing adds nothing.
+    mine, single = np.asarray(run(panel_potential)), np.asarray(run(single_potential))
     assert abs(mine.mean() - single.mean()) < 5.0 * np.hypot(mine.std(), single.std()) / np.sqrt(200)
 
 
@@ -157,10 +161,10 @@ def test_fit_samples_and_reports_the_particles():
 @pytest.mark.slow
 def test_trajectories_agree_with_the_exact_smoother_wherever_they_are_wanted():
     """Paths at single parameter values; a crowd of forecast times changes nothing elsewhere."""
-    at = np.array([0.3, 1.0, 3.5])
+    requested_times = np.array([0.3, 1.0, 3.5])
     draws = {"rate": np.full(600, 0.6)}
-    exact = lfm.smooth(build(0.6), TIMES, Y, at=at)
-    for times in (at, np.concatenate([at, np.linspace(4.0, 8.0, 9)])):
+    exact = lfm.smooth(build(0.6), TIMES, Y, at=requested_times)
+    for times in (requested_times, np.concatenate([requested_times, np.linspace(4.0, 8.0, 9)])):
         result = trajectories(jax.random.key(1), bind(relaxing, TIMES, Y), draws, times,
                              ParticleSettings(200, scheme="srk"), 10)["state"][:, :3, 0]
         sd = np.sqrt(np.asarray(exact.covariance)[:, 0, 0])
@@ -185,7 +189,7 @@ def plain(times, y=None):
     numpyro.sample("y", dist.Normal(numpyro.sample("level", dist.Normal()), 1.0), obs=y)
 
 
-def exactly(times, y=None):
+def observed_exactly(times, y=None):
     rate = numpyro.sample("rate", dist.LogNormal(-0.5, 0.7))
     numpyro.sample("y", lfm.MarginalLikelihood(build(rate, noise=0.0), times), obs=y)
 
@@ -194,7 +198,7 @@ def exactly(times, y=None):
     (relaxing, {"delayed": "no"}, TypeError, "delayed"), (relaxing, {"particles": 0}, ValueError, "particles"),
     (relaxing, {"particle_steps": 0}, ValueError, "particle_steps"),
     (relaxing, {"scheme": "milstien"}, ValueError, "'milstien'"), (plain, {}, ValueError, "site"),
-    (exactly, {}, ValueError, "'y0'"),
+    (observed_exactly, {}, ValueError, "'y0'"),
 ])
 def test_wrong_options_and_models_are_named(model, options, error, name):
     with pytest.raises(error, match=name):

@@ -40,8 +40,8 @@ def lagged(times, y=None, inputs=None, R=None, units=None):
 
 def doses(times, y=None, inputs=None, R=None, units=None):
     lag, rate = parameters()
-    taken, amounts = inputs["rate"].times, inputs["rate"].values
-    events = [lfm.Dose(taken, amounts, "x0"), lfm.Dose(taken, rate, "x0", lag=lag)]
+    dose_times, amounts = inputs["rate"].times, inputs["rate"].values
+    events = [lfm.Dose(dose_times, amounts, "x0"), lfm.Dose(dose_times, rate, "x0", lag=lag)]
     numpyro.sample("y", lfm.MarginalLikelihood(system(
         lambda x, u, t: u - rate * x, R, events=events, units=units), times), obs=y)
 

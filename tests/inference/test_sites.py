@@ -6,7 +6,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
-from two_experiments import TIMES, Y, alone, both, system
+from two_experiments import TIMES, Y, alone, joint_model, system
 
 import lfm_ppl as lfm
 
@@ -15,7 +15,7 @@ Z = jnp.array([-0.7])
 
 @pytest.mark.thorough
 def test_the_log_density_is_the_sum_of_the_sites():
-    bound = lfm.bind(both, TIMES, Y)
+    bound = lfm.bind(joint_model, TIMES, Y)
     singles = {name: lfm.bind(alone(name), TIMES[name], Y[name]) for name in Y}
     log_likelihoods = {name: float(single.log_likelihood(Z)) for name, single in singles.items()}
     expected = float(bound.log_prior(Z)) + sum(log_likelihoods.values())
@@ -33,16 +33,16 @@ def test_the_log_density_is_the_sum_of_the_sites():
 
 
 def test_other_data_of_one_site_or_of_all():
-    bound = lfm.bind(both, TIMES, Y)
-    other = {**Y, "y2": 1.1 * Y["y2"]}
-    expected = lfm.bind(both, TIMES, other)
-    assert float(bound.log_density(Z, other)) == pytest.approx(float(expected.log_density(Z)), abs=1e-12)
-    assert float(bound.site_models["y2"].log_density(Z, other["y2"])) == pytest.approx(
+    bound = lfm.bind(joint_model, TIMES, Y)
+    other_data = {**Y, "y2": 1.1 * Y["y2"]}
+    expected = lfm.bind(joint_model, TIMES, other_data)
+    assert float(bound.log_density(Z, other_data)) == pytest.approx(float(expected.log_density(Z)), abs=1e-12)
+    assert float(bound.site_models["y2"].log_density(Z, other_data["y2"])) == pytest.approx(
         float(expected.log_density(Z)), abs=1e-12)
-    assert float(jax.jit(lambda y: lfm.bind(both, TIMES, y).log_density(Z))(other)) == pytest.approx(
+    assert float(jax.jit(lambda y: lfm.bind(joint_model, TIMES, y).log_density(Z))(other_data)) == pytest.approx(
         float(expected.log_density(Z)), abs=1e-12)
-    assert float(bound.site_models["y2"].with_data(other["y2"]).log_likelihood(Z)) == pytest.approx(
-        float(lfm.bind(alone("y2"), TIMES["y2"], other["y2"]).log_likelihood(Z)), abs=1e-12)
+    assert float(bound.site_models["y2"].with_data(other_data["y2"]).log_likelihood(Z)) == pytest.approx(
+        float(lfm.bind(alone("y2"), TIMES["y2"], other_data["y2"]).log_likelihood(Z)), abs=1e-12)
 
 
 @pytest.mark.thorough
@@ -52,12 +52,12 @@ def test_sites_of_a_model_that_asks_its_data_for_values():
         for name in times:
             numpyro.sample(name, lfm.MarginalLikelihood(system(name, rate), times[name]), obs=y[name])
 
-    def known(times, y):
+    def constant_model(times, y):
         rate = numpyro.sample("a", dist.LogNormal(float(np.nanmean(Y["y"])), 0.5))
         for name in times:
             numpyro.sample(name, lfm.MarginalLikelihood(system(name, rate), times[name]), obs=y[name])
 
-    bound, expected = lfm.bind(looks, TIMES, Y), lfm.bind(known, TIMES, Y)
+    bound, expected = lfm.bind(looks, TIMES, Y), lfm.bind(constant_model, TIMES, Y)
     assert bound.problem.data is None
     minus, gradient = bound.objective().value_and_gradient(Z)
     np.testing.assert_allclose(-gradient, expected.log_density_gradient(Z)[1], rtol=1e-9)
@@ -83,16 +83,16 @@ FIRST = {"y": TIMES["y"]}, {"y": Y["y"]}
 
 @pytest.mark.parametrize(("model", "times", "y", "part"), [
     (arrays, TIMES["y"], Y["y"], "{'y': (times, y), 'y2': (times, y)}"),
-    (both, TIMES["y"], Y["y"], "by site"),
-    (both, *FIRST, "'y2': (times, y)"),
+    (joint_model, TIMES["y"], Y["y"], "by site"),
+    (joint_model, *FIRST, "'y2': (times, y)"),
     (closed, *FIRST, "are y, y2, and there are data of y: "),
     (closed, TIMES, Y, "obs=y['y2']"),
     (arrays, TIMES, Y, "times['y']"),
-    (both, TIMES, {"y": Y["y"]}, "times has y, y2, and y has y."),
-    (both, TIMES, Y["y"], "no dict"),
-    (both, {**TIMES, "y3": TIMES["y"]}, {**Y, "y3": Y["y"]}, "are y, y2, and there are data of y, y2, y3: "),
-    (both, TIMES, {**Y, "y2": Y["y"]}, "site 'y2': "),
-    (both, TIMES, {**Y, "y2": None}, "y['y2']"),
+    (joint_model, TIMES, {"y": Y["y"]}, "times has y, y2, and y has y."),
+    (joint_model, TIMES, Y["y"], "no dict"),
+    (joint_model, {**TIMES, "y3": TIMES["y"]}, {**Y, "y3": Y["y"]}, "are y, y2, and there are data of y, y2, y3: "),
+    (joint_model, TIMES, {**Y, "y2": Y["y"]}, "site 'y2': "),
+    (joint_model, TIMES, {**Y, "y2": None}, "y['y2']"),
 ])
 def test_errors_say_what_to_pass(model, times, y, part):
     with pytest.raises((ValueError, TypeError)) as caught:
@@ -102,4 +102,4 @@ def test_errors_say_what_to_pass(model, times, y, part):
 
 def test_a_function_of_one_site_names_the_sites():
     with pytest.raises(ValueError, match=r"y, y2.*site_models"):
-        lfm.bind(both, TIMES, Y).smooth(Z)
+        lfm.bind(joint_model, TIMES, Y).smooth(Z)

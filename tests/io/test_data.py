@@ -92,16 +92,16 @@ def test_data_and_truth_are_written_and_read_back(tmp_path):
     data = Data([0, 0, 1 / 7], y, ("a", "b"), units={"time": "h"}, truth=truth)
     write_csv(data, tmp_path / "d.csv")
     write_truth(data, tmp_path / "d.json")
-    back = read_csv(tmp_path / "d.csv")
-    np.testing.assert_array_equal(back.times, data.times)
-    np.testing.assert_array_equal(back.y, y)
-    assert (back.outputs, back.units) == (data.outputs, data.units)
+    loaded = read_csv(tmp_path / "d.csv")
+    np.testing.assert_array_equal(loaded.times, data.times)
+    np.testing.assert_array_equal(loaded.y, y)
+    assert (loaded.outputs, loaded.units) == (data.outputs, data.units)
     read = read_truth(tmp_path / "d.json")
     assert read.keys() == truth.keys()
     np.testing.assert_array_equal(read["forces"]["p53"], truth["forces"]["p53"])
     np.testing.assert_array_equal(read["parameters"]["decay"], [0.8, 0.5])
     with pytest.raises(ValueError, match="no truth"):
-        write_truth(back, tmp_path / "t.json")
+        write_truth(loaded, tmp_path / "t.json")
     with pytest.raises(ValueError, match="d.csv"):
         read_truth(tmp_path / "d.csv")
 
@@ -147,8 +147,8 @@ def test_a_long_file_is_read_series_by_series(write):
     with pytest.raises(ValueError, match="row 5.* from 120 to 0.*'ID' changes from 1 to 2.*--series ID ") as raised:
         read_csv(path, outputs=["DV"])
     assert "Sort" not in str(raised.value)
-    other = LONG.replace("ID,", "who,").replace("\n1,", "\nanna,").replace("\n2,", "\nbert,")
-    for text, options in ((LONG, {}), (other, {"outputs": ["DV"]}), (other, {"outputs": ["DV"], "inputs": ["AMT"]}),
+    renamed = LONG.replace("ID,", "who,").replace("\n1,", "\nanna,").replace("\n2,", "\nbert,")
+    for text, options in ((LONG, {}), (renamed, {"outputs": ["DV"]}), (renamed, {"outputs": ["DV"], "inputs": ["AMT"]}),
                           ("ID,time,x\nA,0,1\nB,5,1\nA,3,1\nB,7,1\n", {"outputs": ["x"]})):  # rows may be mixed
         with pytest.raises(ValueError, match="--series (ID|who) "):
             read_csv(write(text), **options)

@@ -67,17 +67,17 @@ def random_file(seed):
 
 def simulate(times, doses, resets):
     """Return the state (T, 2) before the doses at each of the times."""
-    ends = {(t, a, s, d): min([t + d, *(r for r in resets if r > t)]) for t, a, s, d in doses}
-    marks = sorted({*times, *resets, *(dose[0] for dose in doses), *ends.values()})
-    state, now, states = np.zeros(2), 0.0, {}
+    stop_times = {(t, a, s, d): min([t + d, *(r for r in resets if r > t)]) for t, a, s, d in doses}
+    marks = sorted({*times, *resets, *(dose[0] for dose in doses), *stop_times.values()})
+    state, current_time, states = np.zeros(2), 0.0, {}
     for mark in marks:
         generator = np.zeros((3, 3))
         generator[:2, :2] = RATES
-        for (start, amount, index, duration), end in ends.items():
-            if duration and start <= now < end:
+        for (start, amount, index, duration), end in stop_times.items():
+            if duration and start <= current_time < end:
                 generator[index, 2] += amount / duration
-        state = (expm(generator * (mark - now)) @ np.append(state, 1.0))[:2]
-        now = mark
+        state = (expm(generator * (mark - current_time)) @ np.append(state, 1.0))[:2]
+        current_time = mark
         states[mark] = state
         if mark in resets:
             state = np.zeros(2)
@@ -319,8 +319,8 @@ def test_a_later_reset_ends_an_infusion_that_runs(read):
     assert joined.resets.tolist() == [5.0]
     dose = read("TIME,DV,AMT\n6,.,3\n9,1,.\n", "dose:gut").inputs["AMT"]
     assert continued(earlier, dose).resets is None  # the reset at 7 belongs to the rows that are replaced
-    other = InputTable(np.array([6.0]), np.array([1.0]), "dose:blood")
-    tables = continued_inputs({"AMT": dose, "iv": earlier}, {"AMT": later, "iv": other})
+    other_table = InputTable(np.array([6.0]), np.array([1.0]), "dose:blood")
+    tables = continued_inputs({"AMT": dose, "iv": earlier}, {"AMT": later, "iv": other_table})
     assert tables["iv"].durations.tolist() == [5.0, 0.0, 0.0] and tables["AMT"].resets.tolist() == [5.0]
 
 

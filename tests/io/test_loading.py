@@ -86,8 +86,8 @@ def test_a_file_with_the_model_alone(load):
 def test_a_model_gets_names_and_units_where_it_takes_them(load):
     data = Data([0.0], [[1.0, 2.0]], ("a", "b"), units={"time": "hours"})
     assert load("def model(times, y=None, outputs=()): ...").keywords(data, {}) == {"outputs": ("a", "b")}
-    both = load("def model(times, y=None, *, units=None, outputs=()): ...")
-    assert both.keywords(data, {}) == {"outputs": ("a", "b"), "units": {"time": "h"}}
+    model_file = load("def model(times, y=None, *, units=None, outputs=()): ...")
+    assert model_file.keywords(data, {}) == {"outputs": ("a", "b"), "units": {"time": "h"}}
 
 
 def test_options_are_converted_and_have_defaults(load):

@@ -99,9 +99,9 @@ def test_settings_of_a_likelihood_are_its_defaults_and_what_was_given():
     assert likelihood.arguments == {"steps": 4}
     assert likelihood.settings == lfm.MarginalLikelihood(build(1.0), TIMES, rule=lfm.Cubature(), steps=4, iterations=3,
                                                          damping=0.7, method="runge-kutta").settings
-    other = likelihood.with_settings(steps=None, tolerance=1e-2)
-    assert other.arguments == {"tolerance": 1e-2}
-    assert (other.settings.steps, other.settings.iterations, likelihood.settings.steps) == (10, 0, 4)
+    updated = likelihood.with_settings(steps=None, tolerance=1e-2)
+    assert updated.arguments == {"tolerance": 1e-2}
+    assert (updated.settings.steps, updated.settings.iterations, likelihood.settings.steps) == (10, 0, 4)
 
 
 @pytest.mark.parametrize("likelihood", [

@@ -71,7 +71,7 @@ def test_what_cannot_be_fixed(fixed, name):
 
 
 def test_the_prior_of_fixed_elements_in_words():
-    """The free elements' prior and the values of the others; of arguments by element those of the free ones."""
+    """The free elements' prior and the values of the others; arguments by element are those for free elements."""
     trace = numpyro.handlers.trace(numpyro.handlers.seed(fix(model, FIXED, LABELS), 0)).get_trace()
     assert prior(trace["decay"]["fn"]) == "LogNormal(0, 1); fixed: c = 0.8"
     assert prior(trace["u"]["fn"]) == "Uniform([0, 2], 5); fixed: 1 = 2, 3 = 4"

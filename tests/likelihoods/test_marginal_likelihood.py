@@ -128,7 +128,7 @@ def test_handlers(y, prior):
 
 def test_expanded_and_masked_batches(y):
     exact = motif.log_density(y, **motif.THETA)
-    both = jnp.stack([y, 2.0 * y])
+    batch = jnp.stack([y, 2.0 * y])
     mask = jnp.array([True, False])
 
     @jax.jit
@@ -136,7 +136,7 @@ def test_expanded_and_masked_batches(y):
         expanded = lfm.MarginalLikelihood(motif.build(**THETA), TIMES).expand([2])
         return expanded.log_prob(value), expanded.mask(mask).log_prob(value), expanded.to_event(1).log_prob(value)
 
-    plain, masked, event = evaluate(both)
+    plain, masked, event = evaluate(batch)
     np.testing.assert_allclose(plain, [exact, motif.log_density(2.0 * y, **motif.THETA)], rtol=1e-9)
     np.testing.assert_allclose(masked, [exact, 0.0], rtol=1e-9)
     np.testing.assert_allclose(event, plain.sum(), rtol=1e-12)
@@ -144,8 +144,8 @@ def test_expanded_and_masked_batches(y):
 
 def test_prior_predictive_has_the_exact_moments():
     draws = 4000
-    known = handlers.condition(motif.model, THETA)
-    y = np.asarray(Predictive(known, num_samples=draws, parallel=True)(jax.random.key(3), TIMES)["y"])
+    conditioned = handlers.condition(motif.model, THETA)
+    y = np.asarray(Predictive(conditioned, num_samples=draws, parallel=True)(jax.random.key(3), TIMES)["y"])
     assert y.shape == (draws, len(TIMES), 2)
     chol = np.linalg.cholesky(motif.observation_covariance(TIMES, **motif.THETA))
     white = np.linalg.solve(chol, y.reshape(draws, -1).T)

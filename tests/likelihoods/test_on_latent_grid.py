@@ -37,13 +37,13 @@ def test_a_known_start_is_known_in_compiled_code_too():
 
 def test_predictions_follow_the_forces():
     """Given forces and start the observations scatter about their state with the noise, and nothing else."""
-    given = {"decay": jnp.array(0.8), "y_white": 0.3 * jnp.ones((1, 41)), "y_start": jnp.array([0.5])}
-    latent = handlers.condition(lfm.on_latent_grid(linear, points=41), given)
-    drawn = np.asarray(Predictive(latent, num_samples=4000)(jax.random.key(0), TIMES)["y"])
+    latent_values = {"decay": jnp.array(0.8), "y_white": 0.3 * jnp.ones((1, 41)), "y_start": jnp.array([0.5])}
+    latent = handlers.condition(lfm.on_latent_grid(linear, points=41), latent_values)
+    predictions = np.asarray(Predictive(latent, num_samples=4000)(jax.random.key(0), TIMES)["y"])
     site = handlers.trace(handlers.seed(latent, 0)).get_trace(TIMES)["y"]["fn"]
     state = np.asarray(site.latent.state(site.u, site.start))
-    assert np.all(np.abs(drawn.mean(axis=0) - state) < 4.5 * 0.2 / np.sqrt(4000))
-    assert np.all(np.abs(drawn.std(axis=0) / 0.2 - 1) < 4.5 / np.sqrt(8000))
+    assert np.all(np.abs(predictions.mean(axis=0) - state) < 4.5 * 0.2 / np.sqrt(4000))
+    assert np.all(np.abs(predictions.std(axis=0) / 0.2 - 1) < 4.5 / np.sqrt(8000))
     assert site.sample(jax.random.key(1), (2, 3)).shape == (2, 3, 6, 1)
 
 

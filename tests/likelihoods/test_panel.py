@@ -25,7 +25,7 @@ def build(rate, lengthscale):
     )
 
 
-def one(rate, lengthscale, times, y):
+def row_density(rate, lengthscale, times, y):
     return lfm.MarginalLikelihood(build(rate, lengthscale), times, steps=1, iterations=0).log_prob_per_observation(y)
 
 
@@ -44,9 +44,9 @@ def y():
 @pytest.fixture(scope="module")
 def looped(y):
     """Per-observation log densities (3, T), and gradients of each series' sum, one series after another."""
-    both = jax.jit(lambda r, s, t, y: (one(r, s, t, y),
-                                       jax.grad(lambda r, s: one(r, s, t, y).sum(), argnums=(0, 1))(r, s)))
-    return [both(r, LENGTHSCALE, TIMES, y) for r, y in zip(RATES, y, strict=True)], both
+    evaluate = jax.jit(lambda r, s, t, y: (row_density(r, s, t, y),
+                                           jax.grad(lambda r, s: row_density(r, s, t, y).sum(), argnums=(0, 1))(r, s)))
+    return [evaluate(r, LENGTHSCALE, TIMES, y) for r, y in zip(RATES, y, strict=True)], evaluate
 
 
 @pytest.fixture(scope="module")
@@ -206,8 +206,8 @@ def test_samples(y):
 def test_rebuilt_as_a_pytree(y, looped):
     results, _ = looped
     leaves, tree = jax.tree.flatten(panel(jnp.asarray(RATES), LENGTHSCALE, jnp.asarray(TIMES)))
-    again = jax.jit(lambda leaves, y: tree.unflatten(leaves).log_prob(y))(leaves, y)
-    np.testing.assert_allclose(again, [e[0].sum() for e in results], rtol=1e-10)
+    rebuilt = jax.jit(lambda leaves, y: tree.unflatten(leaves).log_prob(y))(leaves, y)
+    np.testing.assert_allclose(rebuilt, [e[0].sum() for e in results], rtol=1e-10)
 
 
 def test_wrong_arguments_are_named(y):

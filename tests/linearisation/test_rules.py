@@ -1,4 +1,4 @@
-"""Each rule by itself, against dense Gauss-Hermite quadrature."""
+"""Each rule alone, against dense Gauss-Hermite quadrature."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DENSE = gauss_hermite(4, 9)
 
 def test_every_public_rule_is_in_the_list_and_has_a_word_on_the_command_line():
     public = {name: getattr(lfm, name) for name in lfm.__all__}
-    kinds = {name for name, one in public.items() if isinstance(one, type) and issubclass(one, lfm.Rule)} - {"Rule"}
+    kinds = {name for name, cls in public.items() if isinstance(cls, type) and issubclass(cls, lfm.Rule)} - {"Rule"}
     assert kinds == {type(rule).__name__ for rule in RULES}, "add it to tests/rules.py"
     assert kinds == set(options.RULES.values()), "give it a word in RULES of lfm_ppl/cli/options.py"
 
@@ -34,8 +34,8 @@ def structure(points, averaged=(), constant=()):
 
 
 def linearise(rule, function, where, slope=None, covariance=COVARIANCE, outputs=2):
-    chosen = list((*where.nonlinear, *where.averaged))
-    inputs = Inputs(jnp.asarray(MEAN), jnp.asarray(covariance[np.ix_(chosen, chosen)]),
+    indices = list((*where.nonlinear, *where.averaged))
+    inputs = Inputs(jnp.asarray(MEAN), jnp.asarray(covariance[np.ix_(indices, indices)]),
                     1e-6 * jnp.ones(len(where.nonlinear)))
     slope = jnp.zeros((outputs, 4)) if slope is None else slope
     return rule.linearise(lambda v: (function(v), function(v) ** 2), inputs, where, slope)
@@ -43,11 +43,11 @@ def linearise(rule, function, where, slope=None, covariance=COVARIANCE, outputs=
 
 def exact(function, covariance=COVARIANCE):
     """E f, A = Cov(f, v) P^-1 and Omega, by a tensor of 9 Gauss-Hermite points an input."""
-    at = MEAN + DENSE.nodes @ np.linalg.cholesky(covariance).T
-    values = np.asarray(jax.vmap(function)(jnp.asarray(at)))
+    points = MEAN + DENSE.nodes @ np.linalg.cholesky(covariance).T
+    values = np.asarray(jax.vmap(function)(jnp.asarray(points)))
     mean = DENSE.weights @ values
     centred = values - mean
-    cross = (DENSE.weights[:, None] * centred).T @ (at - MEAN)
+    cross = (DENSE.weights[:, None] * centred).T @ (points - MEAN)
     slope = np.linalg.solve(covariance, cross.T).T
     return mean, slope, (DENSE.weights[:, None] * centred).T @ centred - slope @ covariance @ slope.T
 
@@ -89,15 +89,20 @@ def test_expectations_to_degree_three(rule):
 def test_gauss_hermite_within_its_degree(order):
     """Degree 2 order - 1 in each input: A and Omega of a function of degree (order - 1) are exact."""
     power = order - 1
-    function = lambda v: jnp.stack([(v[0] + v[1]) ** power, v[3] ** power - v[0]])  # noqa: E731
+
+    def function(v):
+        return jnp.stack([(v[0] + v[1]) ** power, v[3] ** power - v[0]])
+
     result = linearise(lfm.GaussHermite(order), function, structure((0, 1, 2, 3)))
-    for one, other in zip((result.value, result.jacobian, result.residual_cov), exact(function), strict=True):
-        assert np.allclose(one, other, rtol=1e-10, atol=1e-11)
+    for computed, expected in zip((result.value, result.jacobian, result.residual_cov), exact(function), strict=True):
+        assert np.allclose(computed, expected, rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize("rule", SIGMA, ids=ids)
 def test_residual_covariance_is_semidefinite(rule):
-    function = lambda v: jnp.stack([jnp.sin(v[0]) * v[1], jnp.exp(0.5 * v[2]) + v[3] ** 2])  # noqa: E731
+    def function(v):
+        return jnp.stack([jnp.sin(v[0]) * v[1], jnp.exp(0.5 * v[2]) + v[3] ** 2])
+
     result = linearise(rule, function, structure((0, 1, 2, 3)))
     eigenvalues = np.linalg.eigvalsh(result.residual_cov)
     assert eigenvalues[0] >= -1e-13 * eigenvalues[-1]
@@ -105,33 +110,42 @@ def test_residual_covariance_is_semidefinite(rule):
 
 @pytest.mark.parametrize("rule", [lfm.GaussHermite(5), lfm.GaussHermite(3)], ids=ids)
 def test_averaged_coordinates_are_exact(rule):
-    """R(r, v) u: points in r and v alone give all moments, those of u by conditioning."""
-    function = lambda v: jnp.stack([v[0] * v[2] + v[1] * v[3], (1.0 + v[1]) * v[2] - 0.3 * v[3]])  # noqa: E731
+    """R(r, v) u: points in r and v alone give all moments, the moments of u by conditioning."""
+
+    def function(v):
+        return jnp.stack([v[0] * v[2] + v[1] * v[3], (1.0 + v[1]) * v[2] - 0.3 * v[3]])
+
     result = linearise(rule, function, structure((0, 1), (2, 3)))
-    for one, other in zip((result.value, result.jacobian, result.residual_cov), exact(function), strict=True):
-        assert np.allclose(one, other, rtol=1e-10, atol=1e-11)
+    for computed, expected in zip((result.value, result.jacobian, result.residual_cov), exact(function), strict=True):
+        assert np.allclose(computed, expected, rtol=1e-10, atol=1e-11)
 
 
 def test_constant_coordinates_follow_by_linearity():
     """0.5 v3 enters linearly: its slope is given, and the points lie in v0 alone."""
-    function = lambda v: jnp.stack([v[0] ** 2 * (1 + v[1]) + 0.5 * v[3], v[0] - 2.0 * v[2]])  # noqa: E731
-    given = jnp.zeros((2, 4)).at[0, 3].set(0.5).at[1, 2].set(-2.0)
-    result = linearise(lfm.GaussHermite(4), function, structure((0,), (1,), (2, 3)), given)
+
+    def function(v):
+        return jnp.stack([v[0] ** 2 * (1 + v[1]) + 0.5 * v[3], v[0] - 2.0 * v[2]])
+
+    linear_part = jnp.zeros((2, 4)).at[0, 3].set(0.5).at[1, 2].set(-2.0)
+    result = linearise(lfm.GaussHermite(4), function, structure((0,), (1,), (2, 3)), linear_part)
     mean, slope, residual = exact(function)
     assert np.allclose(result.value, mean, rtol=1e-11) and np.allclose(result.jacobian, slope, rtol=1e-10, atol=1e-11)
     assert np.allclose(result.residual_cov, residual, rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize("rule", SIGMA, ids=ids)
-@pytest.mark.parametrize("known", [(0, 3)])
-def test_without_variance_the_slope_is_the_jacobian(rule, known):
-    keep = np.array([i not in known for i in range(4)])
+@pytest.mark.parametrize("constant", [(0, 3)])
+def test_without_variance_the_slope_is_the_jacobian(rule, constant):
+    keep = np.array([i not in constant for i in range(4)])
     covariance = COVARIANCE * keep[:, None] * keep
-    function = lambda v: jnp.stack([jnp.sin(v[0]) + v[1] ** 3 + v[2], jnp.exp(v[3]) - v[2]])  # noqa: E731
+
+    def function(v):
+        return jnp.stack([jnp.sin(v[0]) + v[1] ** 3 + v[2], jnp.exp(v[3]) - v[2]])
+
     result = linearise(rule, function, structure((0, 1, 2, 3)), covariance=covariance)
     jacobian = np.asarray(jax.jacfwd(function)(jnp.asarray(MEAN)))
     assert np.isfinite(result.jacobian).all()
-    assert np.allclose(result.jacobian[:, list(known)], jacobian[:, list(known)], atol=1e-7)
+    assert np.allclose(result.jacobian[:, list(constant)], jacobian[:, list(constant)], atol=1e-7)
     gradient = jax.jacrev(lambda scale: linearise(rule, lambda v: scale * function(v), structure((0, 1, 2, 3)),
                                                   covariance=covariance).jacobian)(1.0)
     assert np.allclose(gradient, result.jacobian, atol=1e-8)
@@ -151,7 +165,10 @@ def test_central_differences_are_stirlings_formula():
     """Mean and covariance of Norgaard et al. (2000), equations 29 and 31, in two inputs."""
     h = 1.7
     root = np.array([[0.7, 0.0], [0.2, 0.4]])
-    f = lambda v: jnp.stack([jnp.sin(v[0]) * v[1], v[0] ** 2 + jnp.cos(v[1])])  # noqa: E731
+
+    def f(v):
+        return jnp.stack([jnp.sin(v[0]) * v[1], v[0] ** 2 + jnp.cos(v[1])])
+
     mean = MEAN[:2]
     inputs = Inputs(jnp.asarray(mean), jnp.asarray(root @ root.T), 1e-6 * jnp.ones(2))
     where = InputStructure((0, 1), (), (), ((True, True),), True)

@@ -68,15 +68,15 @@ FUNCTIONS = {
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_helper_that_changes_between_two_models(name, monkeypatch):
     observation, function = gaussian(observed), FUNCTIONS[name]
-    before = float(function(build(decay, observation)))
+    initial_value = float(function(build(decay, observation)))
     with compilations() as compiled:
-        assert float(function(build(decay, observation))) == before
+        assert float(function(build(decay, observation))) == initial_value
     assert compiled == [] or name in ("jit", "likelihood")  # which users compile
     monkeypatch.setitem(decay.__globals__, "RATE", 2.0)
     expected = build(lambda x, u, t: -2.0 * x, gaussian(lambda x, u, t: 2.0 * x))
-    after = float(function(build(decay, observation)))
-    assert after == pytest.approx(float(function(expected)), rel=1e-12)
-    assert abs(after - before) > 1e-3
+    changed_value = float(function(build(decay, observation)))
+    assert changed_value == pytest.approx(float(function(expected)), rel=1e-12)
+    assert abs(changed_value - initial_value) > 1e-3
 
 
 def test_an_object_without_a_hash():

@@ -74,14 +74,14 @@ def test_jumps_at_rows_keep_the_order_four():
 
 def test_simulated_states_jump_with_the_input():
     model = pushed(lambda x, u, t: STEP(t) - x)
-    drawn = lfm.simulate(jax.random.key(0), model, ROWS, steps=400)
-    assert np.allclose(drawn.state[:, 0], response(lambda x, v: v - x), atol=1e-5)
+    simulation = lfm.simulate(jax.random.key(0), model, ROWS, steps=400)
+    assert np.allclose(simulation.state[:, 0], response(lambda x, v: v - x), atol=1e-5)
 
 
 LINE = lfm.Input([0.0, 1.0, 2.0], [0.0, 5.0, 1.0], "linear")
 
 
-class Heated(eqx.Module):
+class DelayedInput(eqx.Module):
     """input(t - delay) - x, with the input among the module's fields."""
 
     power: lfm.Input
@@ -91,7 +91,7 @@ class Heated(eqx.Module):
         return self.power(t - self.delay) - x
 
 
-def told(model, times=ROWS, **options):
+def smoother_warnings(model, times=ROWS, **options):
     """The messages of warnings of a smoother."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -103,31 +103,31 @@ ENDED = "known input in dynamics, whose table goes from 0 to 2, is read at time 
 
 
 @pytest.mark.parametrize("dynamics", [
-    Heated(LINE), lambda x, u, t: LINE(t) - x, jax.jit(lambda x, u, t: LINE(t) - x),
+    DelayedInput(LINE), lambda x, u, t: LINE(t) - x, jax.jit(lambda x, u, t: LINE(t) - x),
     lambda x, u, t: jax.vmap(LINE)(t + jnp.arange(-1.0, 1.0)).sum() * x,
 ], ids=["module", "closure", "compiled", "mapped"])
 def test_reading_beyond_the_table_is_told(dynamics):
     model = pushed(dynamics)
-    (message,) = {text for text in told(model) if "last value" in text}
+    (message,) = {text for text in smoother_warnings(model) if "last value" in text}
     assert ENDED in message and 'outside="hold"' in message
 
 
 @pytest.mark.thorough
 def test_reading_is_told_everywhere():
-    model, y = pushed(Heated(LINE)), np.zeros((4, 1))
+    model, y = pushed(DelayedInput(LINE)), np.zeros((4, 1))
     for call in (lambda: lfm.filter(model, ROWS, y), lambda: lfm.MarginalLikelihood(model, ROWS).ssm,
                  lambda: lfm.MarginalLikelihood(model, ROWS).time_grid,
                  lambda: lfm.simulate(jax.random.key(0), model, ROWS, steps=2),
-                 lambda: lfm.MarginalLikelihood(pushed(Heated(LINE)), ROWS[:3]).smooth(y[:3], at=[2.5, 3.0])):
+                 lambda: lfm.MarginalLikelihood(pushed(DelayedInput(LINE)), ROWS[:3]).smooth(y[:3], at=[2.5, 3.0])):
         with pytest.warns(UserWarning, match="is read at time 3"):
             call()
     observation = lfm.GaussianObservation(lambda x, u, t: x + LINE(t), jnp.array([0.1]))
     measured = lfm.LatentForceModel(lambda x, u, t: -x, {}, observation, PRIOR)
-    assert "known input in the observation function" in told(measured)[0]
+    assert "known input in the observation function" in smoother_warnings(measured)[0]
     noisy = lfm.LatentForceModel(lambda x, u, t: -x, {}, OBSERVATION, PRIOR, lambda x, u, t: LINE(t)[None, None])
-    assert "known input in process_noise" in told(noisy)[0]
+    assert "known input in process_noise" in smoother_warnings(noisy)[0]
     pulled = lfm.LatentForceModel(lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0, mean=LINE)}, OBSERVATION, PRIOR)
-    assert "known input in the mean of the force 'u'" in told(pulled)[0]
+    assert "known input in the mean of the force 'u'" in smoother_warnings(pulled)[0]
 
 
 PRIOR = lfm.Gaussian(jnp.zeros(1), jnp.eye(1))
@@ -135,25 +135,25 @@ OBSERVATION = lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1]))
 
 
 @pytest.mark.parametrize("dynamics, options, message", [
-    (Heated(LINE), {"times": ROWS[:3]}, None),
-    (Heated(LINE), {"times": ROWS[:3], "at": np.array([2.5])}, "is read at time 2.5, where its last value holds"),
-    (Heated(LINE, delay=1.0), {"times": ROWS + 1.0}, "is read at time 3, where its last"),
-    (Heated(LINE, delay=1.0), {}, "is read at time -1, where its first value holds"),
-    (Heated(LINE, delay=1.0), {"times": 1.0 + ROWS[:3]}, None),
-    (Heated(STEP), {}, None),
-    (Heated(STEP), {"at": np.array([3.5])}, "is read at time 3.5, where its last value holds"),
-    (Heated(lfm.Input([0.0], [2.0])), {}, None),
-    (Heated(lfm.Input([0.0, 1.0], [2.0, 1.0], "linear", outside="hold")), {}, None),
+    (DelayedInput(LINE), {"times": ROWS[:3]}, None),
+    (DelayedInput(LINE), {"times": ROWS[:3], "at": np.array([2.5])}, "is read at time 2.5, where its last value holds"),
+    (DelayedInput(LINE, delay=1.0), {"times": ROWS + 1.0}, "is read at time 3, where its last"),
+    (DelayedInput(LINE, delay=1.0), {}, "is read at time -1, where its first value holds"),
+    (DelayedInput(LINE, delay=1.0), {"times": 1.0 + ROWS[:3]}, None),
+    (DelayedInput(STEP), {}, None),
+    (DelayedInput(STEP), {"at": np.array([3.5])}, "is read at time 3.5, where its last value holds"),
+    (DelayedInput(lfm.Input([0.0], [2.0])), {}, None),
+    (DelayedInput(lfm.Input([0.0, 1.0], [2.0, 1.0], "linear", outside="hold")), {}, None),
     (lambda x, u, t: LINE(jnp.clip(t, 0.0, 2.0)) - x, {}, None),
 ])
 def test_what_is_beyond(dynamics, options, message):
     """A value that holds until the next time may do so after the last for as long as before; delays count."""
-    result = told(pushed(dynamics), **options)
+    result = smoother_warnings(pushed(dynamics), **options)
     assert (message is None and not result) or message in result[0]
 
 
 def test_reading_beyond_may_be_an_error():
-    model = pushed(Heated(lfm.Input([0.0, 1.0], [2.0, 1.0], "linear", outside="error")))
+    model = pushed(DelayedInput(lfm.Input([0.0, 1.0], [2.0, 1.0], "linear", outside="error")))
     with pytest.raises(ValueError, match="whose table goes from 0 to 1, is read at time 3"):
         lfm.filter(model, ROWS, np.zeros((4, 1)))
 
@@ -161,7 +161,7 @@ def test_reading_beyond_may_be_an_error():
 def test_compiled_code_says_what_is_known():
     """Nothing of a table that is traced; the warning of one that is not comes while the program is traced."""
     def traced(table):
-        return lfm.MarginalLikelihood(pushed(Heated(table)), ROWS).event_shape[0] * table.values[0]
+        return lfm.MarginalLikelihood(pushed(DelayedInput(table)), ROWS).event_shape[0] * table.values[0]
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -178,7 +178,7 @@ def test_a_warning_names_the_input():
 
 
 def test_a_forecast_needs_an_input_as_far_as_it_is_asked_for():
-    """And not as far as the last of its intervals, which are as long as those of the data."""
+    """And not as far as the last of its intervals, which are as long as the intervals of the data."""
     model = pushed(lambda x, u, t: jnp.tanh(x) * lfm.Input([0.0, 3.6], [1.0, 2.0], "linear", outside="error")(t))
     y = np.full((4, 1), 0.3)
     assert np.isfinite(lfm.smooth(model, ROWS, y, steps=1, at=[3.6]).mean).all()

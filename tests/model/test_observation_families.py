@@ -59,7 +59,7 @@ WHOLE = np.arange(-10.0, 400.0), np.ones(410)
 
 def test_every_public_family_is_among_the_cases():
     public = {name: getattr(lfm, name) for name in lfm.__all__}
-    kinds = {name for name, one in public.items() if isinstance(one, type) and issubclass(one, lfm.ObservationFamily)}
+    kinds = {name for name, cls in public.items() if isinstance(cls, type) and issubclass(cls, lfm.ObservationFamily)}
     missing = kinds - {type(family).__name__ for family, *_ in CASES.values()} - {"ObservationFamily", "Observations"}
     assert not missing, f"add a line to CASES in this file for {missing}"
 
@@ -104,7 +104,7 @@ def test_log_prob_of_large_counts(y, distance):
 
 @pytest.mark.parametrize("name", [name for name in CASES if "Student" not in name])
 def test_draws_have_these_densities(name):
-    """Mean and variance of 20,000 draws against those of the density, to five standard errors."""
+    """Mean and variance of 20,000 draws against the moments of the density, to five standard errors."""
     family, _, log_prob = CASES[name]
     draws = np.asarray(jax.vmap(lambda key: family.sample(key, jnp.asarray(PREDICTOR)))(
         jax.random.split(jax.random.key(0), 20_000)))
@@ -131,9 +131,9 @@ def test_cumulative_probabilities_are_sums_of_the_densities(name):
     values, weight = VALUES.get(name, WHOLE)
     with np.errstate(divide="ignore"):
         probability = np.nan_to_num(np.exp(log_prob(values[:, None], PREDICTOR))) * weight[:, None]
-    inside = 1e-5 if name == "censored" else 1e-9  # of a Riemann sum
-    np.testing.assert_allclose(below, (probability * (values[:, None] < y - 1e-9)).sum(0), atol=inside)
-    np.testing.assert_allclose(up_to, (probability * (values[:, None] <= y + 1e-9)).sum(0), atol=inside)
+    tolerance = 1e-5 if name == "censored" else 1e-9  # of a Riemann sum
+    np.testing.assert_allclose(below, (probability * (values[:, None] < y - 1e-9)).sum(0), atol=tolerance)
+    np.testing.assert_allclose(up_to, (probability * (values[:, None] <= y + 1e-9)).sum(0), atol=tolerance)
 
 
 def test_a_family_without_cumulative_probabilities_has_none():
@@ -204,18 +204,19 @@ def test_errors(make, message):
 
 
 def test_simulation_draws_from_the_family():
-    both = lfm.Observations(lfm.PoissonObservation(lambda x, u, t: x[:1]), lfm.BernoulliObservation(lambda x, u, t: x))
-    y = np.asarray(lfm.simulate(jax.random.key(0), model(both), np.arange(4.0)).y)
+    observations = lfm.Observations(lfm.PoissonObservation(lambda x, u, t: x[:1]),
+                                    lfm.BernoulliObservation(lambda x, u, t: x))
+    y = np.asarray(lfm.simulate(jax.random.key(0), model(observations), np.arange(4.0)).y)
     assert y.shape == (4, 3) and np.all(y == np.round(y)) and np.isin(y[:, 1:], (0.0, 1.0)).all()
 
 
 def test_a_particle_filter_weighs_with_the_family():
     """One observation of a known predictor: the estimate is its probability."""
-    known = lfm.LatentForceModel(lambda x, u, t: -x, {}, lfm.PoissonObservation(state),
-                                 lfm.Gaussian(jnp.array([0.7]), jnp.zeros((1, 1))))
-    result = lfm.particle_filter(jax.random.key(0), known, [0.0], [[3.0]], particles=10)
+    known_model = lfm.LatentForceModel(lambda x, u, t: -x, {}, lfm.PoissonObservation(state),
+                                       lfm.Gaussian(jnp.array([0.7]), jnp.zeros((1, 1))))
+    result = lfm.particle_filter(jax.random.key(0), known_model, [0.0], [[3.0]], particles=10)
     assert result.log_likelihood[0] == pytest.approx(stats.poisson.logpmf(3, np.exp(0.7)), abs=1e-12)
-    filtered = lfm.filter(known, [0.0], [[3.0]]).log_likelihood[0]
+    filtered = lfm.filter(known_model, [0.0], [[3.0]]).log_likelihood[0]
     assert filtered == pytest.approx(float(result.log_likelihood[0]), abs=1e-7)
 
 

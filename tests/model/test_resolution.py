@@ -97,13 +97,13 @@ def test_silent_inside_compiled_code_and_for_other_forces():
 
 def test_terms_of_sums_and_odd_cases():
     times = np.linspace(0.0, 1.0, 50)
-    both = lfm.SquaredExponential(1.0, 0.2, 2) + lfm.Matern(1.0, 0.1, 0) + lfm.Constant(1.0)
-    (result,) = resolutions(model(both, 0.01), times)
+    kernel_sum = lfm.SquaredExponential(1.0, 0.2, 2) + lfm.Matern(1.0, 0.1, 0) + lfm.Constant(1.0)
+    (result,) = resolutions(model(kernel_sum, 0.01), times)
     (alone,) = resolutions(model(lfm.SquaredExponential(1.0, 0.2, 2), 0.01), times)
     assert TOLERANCE < result.error < alone.error  # a rough force hides the difference
     assert resolutions(model(lfm.SquaredExponential(1.0, 0.2), 0.1), times[:1]) == []
-    for at in (np.zeros(3), 1e6 * times, 1e-9 * times):
-        (result,) = resolutions(model(lfm.SquaredExponential(1.0, 0.2), 0.1), at)
+    for scaled_times in (np.zeros(3), 1e6 * times, 1e-9 * times):
+        (result,) = resolutions(model(lfm.SquaredExponential(1.0, 0.2), 0.1), scaled_times)
         assert result.error < TOLERANCE
     # Without noise nothing can be trusted, and a model that overflows is passed over.
     assert resolutions(model(lfm.SquaredExponential(1.0, 0.1), 1e-12), np.linspace(0, 1, 200))[0].error > TOLERANCE
@@ -116,20 +116,20 @@ def test_only_what_is_observed_counts():
     times = np.linspace(0.0, 10.0, 401)
     y = np.full((401, 1), np.nan)
     y[::40] = 0.5
-    one = model(lfm.SquaredExponential(1.0, 1.0, 4), 0.03)
-    (padded,) = resolutions(one, times, y)
-    (observed,) = resolutions(one, times[::40])
-    assert padded.error == observed.error < resolutions(one, times)[0].error
+    system = model(lfm.SquaredExponential(1.0, 1.0, 4), 0.03)
+    (padded,) = resolutions(system, times, y)
+    (observed,) = resolutions(system, times[::40])
+    assert padded.error == observed.error < resolutions(system, times)[0].error
 
 
 @pytest.mark.thorough
 def test_the_noise_of_most_rows_counts():
     """A covariance for each time, the first of which is tiny."""
     times = np.linspace(0.0, 10.0, 21)
-    one = model(lfm.SquaredExponential(1.0, 1.0, 4), 0.1)
-    varying = eqx.tree_at(lambda m: m.observation.covariance, one,
+    system = model(lfm.SquaredExponential(1.0, 1.0, 4), 0.1)
+    varying = eqx.tree_at(lambda m: m.observation.covariance, system,
                           jnp.full((21, 1, 1), 0.01).at[0].set(1e-12))
-    np.testing.assert_allclose(resolutions(varying, times)[0].error, resolutions(one, times)[0].error, rtol=1e-9)
+    np.testing.assert_allclose(resolutions(varying, times)[0].error, resolutions(system, times)[0].error, rtol=1e-9)
 
 
 def test_a_model_with_process_noise_is_passed_over():

@@ -64,7 +64,10 @@ def test_noise_free_motion_converges_with_the_steps():
 def test_double_well_settles_into_its_stationary_density():
     """p(x) ~ exp(2 (x^2 / 2 - x^4 / 4) / s^2), by quadrature."""
     s = 1.2
-    density = lambda x, k: x**k * np.exp(2 / s**2 * (x**2 / 2 - x**4 / 4))  # noqa: E731
+
+    def density(x, k):
+        return x**k * np.exp(2 / s**2 * (x**2 / 2 - x**4 / 4))
+
     moment = {k: quad(density, -6, 6, args=(k,))[0] / quad(density, -6, 6, args=(0,))[0] for k in (2, 4, 8)}
     model = double_well(mean=0.0, variance=0.8, dispersion=s)
     draw = jax.jit(jax.vmap(lambda key: lfm.simulate(key, model, [8.0], steps=800).state[0, 0]))
@@ -98,8 +101,8 @@ def test_a_jump_at_a_row_is_never_lost():
     force = lfm.forces.SQM(1e-2, tuple(times[1:]))
     model = lfm.LatentForceModel(lambda x, u, t: x, {"u": force}, lfm.GaussianObservation(
         lambda x, u, t: u, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
-    drawn = lfm.simulate(jax.random.key(0), model, times, steps=3).forces["u"]
-    assert len(np.unique(drawn)) == 40
+    force_path = lfm.simulate(jax.random.key(0), model, times, steps=3).forces["u"]
+    assert len(np.unique(force_path)) == 40
 
 
 def test_a_fast_rate_between_sparse_times():

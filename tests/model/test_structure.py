@@ -86,8 +86,8 @@ def test_primitives(function, points, averaged):
 
 def numeric_hessian(function, size, seed):
     generator = np.random.default_rng(seed)
-    at = generator.normal(size=(4, size))
-    hessians = [np.abs(np.asarray(jax.jacfwd(jax.jacfwd(function))(jnp.asarray(v)))) for v in at]
+    points = generator.normal(size=(4, size))
+    hessians = [np.abs(np.asarray(jax.jacfwd(jax.jacfwd(function))(jnp.asarray(v)))) for v in points]
     return np.max([hessian.max(axis=0) for hessian in hessians], axis=0) > 1e-9
 
 
@@ -151,8 +151,11 @@ def test_custom_rules_are_seen_through_or_taken_as_non_linear():
         return v**2
 
     square.defjvp(lambda primals, tangents: (primals[0] ** 2, 2 * primals[0] * tangents[0]))
-    callback = lambda v: jax.pure_callback(  # noqa: E731
-        lambda a: np.sin(a), jax.ShapeDtypeStruct((2,), float), v)
+
+    def callback(v):
+        return jax.pure_callback(
+            lambda a: np.sin(a), jax.ShapeDtypeStruct((2,), float), v)
+
     for function in (cube, square, callback):
         result = pattern(lambda v, f=function: f(v[:2]) + v[2:], 4).hessian
         assert result[0, 0] and result[1, 1] and not result[2:].any()

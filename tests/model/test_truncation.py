@@ -40,8 +40,8 @@ def covariances(times, functions, evolution, sd, trend=0.0):
     order = np.arange(functions // 2 + 1)
     coefficients = 9.0 * ive(order, 0.5) * np.where(order, 2.0, 1.0)
     truncated = sum(c * np.cos(2 * np.pi * j * lag) for j, c in zip(order, coefficients, strict=True))
-    rest = trend + sd**2 * np.eye(times.size)
-    return 9.0 * np.exp(-np.sin(np.pi * lag) ** 2) * evolution(lag) + rest, truncated * evolution(lag) + rest
+    remainder = trend + sd**2 * np.eye(times.size)
+    return 9.0 * np.exp(-np.sin(np.pi * lag) ** 2) * evolution(lag) + remainder, truncated * evolution(lag) + remainder
 
 
 def error(exact, truncated):
@@ -156,5 +156,5 @@ def test_silent_where_nothing_is_wrong_or_nothing_can_be_told():
     y = np.full((WEEKLY.size, 1), np.nan)
     y[:40] = 0.0
     (part,) = truncations(model(few + lfm.Matern(20.0, 10.0), 0.1), WEEKLY, y)
-    (whole,) = truncations(model(few + lfm.Matern(20.0, 10.0), 0.1), WEEKLY)
-    assert part.error < 0.5 * whole.error
+    (without_data,) = truncations(model(few + lfm.Matern(20.0, 10.0), 0.1), WEEKLY)
+    assert part.error < 0.5 * without_data.error

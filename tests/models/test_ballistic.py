@@ -21,34 +21,34 @@ def module(name):
 @pytest.mark.slow
 def test_one_step_between_measurements_is_exact():
     """Over the prior: to 0.005 everywhere, and to 0.001 within 50 nats of the best, where a posterior may be."""
-    file, own = loading.load("ballistic"), module("ballistic")
+    file, model_file = loading.load("ballistic"), module("ballistic")
     data = file.simulate()
 
-    def both(z):
-        system = own.build(*jnp.exp(z), **own.KNOWN)
-        one, eight = (lfm.MarginalLikelihood(system, data.times, steps=steps) for steps in (1, 8))
-        return one.log_prob(data.y), eight.log_prob(data.y)
+    def densities(z):
+        system = model_file.build(*jnp.exp(z), **model_file.KNOWN)
+        single, eight = (lfm.MarginalLikelihood(system, data.times, steps=steps) for steps in (1, 8))
+        return single.log_prob(data.y), eight.log_prob(data.y)
 
     centre = np.log([5e-4, 30.0, 5.0])
     spread = np.array([1.0, 1.0, 0.7])
     points = centre + spread * np.random.default_rng(0).uniform(-1.5, 1.5, (12, 3))
-    one, eight = jax.jit(lambda all_: jax.lax.map(both, all_, batch_size=4))(jnp.asarray(points))
-    one, eight = np.asarray(one), np.asarray(eight)
+    single, eight = jax.jit(lambda all_: jax.lax.map(densities, all_, batch_size=4))(jnp.asarray(points))
+    single, eight = np.asarray(single), np.asarray(eight)
     possible = eight > eight.max() - 50.0
     assert 3 < possible.sum() < 12
-    np.testing.assert_allclose(one, eight, rtol=0, atol=5e-3)
-    np.testing.assert_allclose(one[possible], eight[possible], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(single, eight, rtol=0, atol=5e-3)
+    np.testing.assert_allclose(single[possible], eight[possible], rtol=0, atol=1e-3)
 
 
 @pytest.fixture(scope="module")
 def likelihoods():
     """Return (data, function of bearing and measurements -> log likelihood and smoothed means) in three dimensions."""
-    own = module("ballistic_3d")
+    model_file = module("ballistic_3d")
     data = loading.load("ballistic-3d").simulate()
 
     def run(bearing, y):
-        system = own.build(**own.TRUTH, bearing=bearing)
-        result = lfm.smooth(system, data.times, y, steps=1, max_step=own.LONGEST_STEP, iterations=0)
+        system = model_file.build(**model_file.TRUTH, bearing=bearing)
+        result = lfm.smooth(system, data.times, y, steps=1, max_step=model_file.LONGEST_STEP, iterations=0)
         return result.log_likelihood.sum(), result.mean
 
     return data, jax.jit(run)
@@ -65,9 +65,9 @@ def test_turning_the_radar_changes_nothing(likelihoods, bearing):
     assert bearing != np.pi or np.abs(np.diff(turned[:, 1])).max() < 0.1
     turned[::3, 1] += 2 * np.pi  # the same angle
     expected, mean = run(0.0, data.y)
-    result, other = run(bearing, turned)
+    result, turned_mean = run(bearing, turned)
     np.testing.assert_allclose(result, expected, rtol=1e-8)
-    np.testing.assert_allclose(other, mean, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(turned_mean, mean, rtol=1e-6, atol=1e-6)
 
 
 def test_the_smoother_finds_the_target_where_the_azimuth_jumps(likelihoods):
@@ -88,8 +88,8 @@ def test_gross_errors_move_parameters_only_where_errors_are_gaussian():
         bound = bind(file.model, data.times, data.y, model_kwargs=file.keywords(data, {"df": df}))
         bound = bound.fix(file.anchors(data))
         start = bound.draw(jax.random.key(0))
-        for place in range(3):
-            rng = np.random.default_rng(place)
+        for seed in range(3):
+            rng = np.random.default_rng(seed)
             spoilt = np.zeros(data.y.shape, bool)
             spoilt[rng.choice(len(spoilt), 6, replace=False)] = True
             error = 600.0 * rng.choice([-1.0, 1.0], data.y.shape)

@@ -14,7 +14,7 @@ from lfm_ppl.io import loading
 from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 
 
-def own():
+def model_module():
     """Return the module of the model file."""
     return sys.modules[loading.load("call-centre").model.__module__]
 
@@ -23,7 +23,7 @@ def own():
 def test_the_drift_is_that_of_the_fluid_equation(link):
     """In customers: dL/dt = (1 + L) dx/dt, without the bound on settling."""
     service = lfm.Input([0.0, 100.0], [10.0, 5.0])
-    system = own().build(6.0, 2.0, 0.5, 200.0, 10.0, link=link, service=service, fastest=0.0)
+    system = model_module().build(6.0, 2.0, 0.5, 200.0, 10.0, link=link, service=service, fastest=0.0)
     for customers, u, t, omega in ((0.2, 4.0, 10.0, 10.0), (30.0, 9.0, 150.0, 5.0), (2.0, -1.0, 100.0, 5.0)):
         slope = system.dynamics(jnp.log1p(jnp.array([customers])), jnp.array([u]), t)
         rate = np.log1p(np.exp(u)) if link == "softplus" else u
@@ -32,7 +32,7 @@ def test_the_drift_is_that_of_the_fluid_equation(link):
 
 def test_a_known_rate_gives_a_known_queue():
     """A force without variance: the mean is the solution, through overload and a change of the service rate."""
-    m = own()
+    m = model_module()
     service = lfm.Input([0.0, 300.0], [10.0, 5.0])
     system = m.build(7.0, 1e-6, 0.5, 200.0, force="matern", service=service, fastest=0.0)
     system = lfm.LatentForceModel(system.dynamics, system.forces, system.observation,
@@ -42,9 +42,9 @@ def test_a_known_rate_gives_a_known_queue():
     path = [1.0]
     for begin in times[:-1]:
         omega = 10.0 if begin < 300.0 else 5.0
-        one = integrate.solve_ivp(lambda t, x: 7.0 - omega * x / (1 + x), (0, 20.0), path[-1:],  # noqa: B023
-                                  rtol=1e-10, atol=1e-10)
-        path.append(one.y[0, -1])
+        solution = integrate.solve_ivp(lambda t, x: 7.0 - omega * x / (1 + x), (0, 20.0), path[-1:],  # noqa: B023
+                                       rtol=1e-10, atol=1e-10)
+        path.append(solution.y[0, -1])
     np.testing.assert_allclose(np.expm1(result.predicted_mean[:, 0]), path, rtol=1e-4)
 
 
@@ -52,7 +52,7 @@ def test_a_known_rate_gives_a_known_queue():
                                                  ("resonator", 2.1)])
 def test_every_force_has_the_covariance_that_is_said(force, variance):
     """At a distance of two cycles, and at one time: as shares of scale^2; eigenfunctions left out may miss a little."""
-    m = own()
+    m = model_module()
     values = {"mean": 6.0, "scale": 2.0, "lengthscale": 400.0, "memory": 10.0}
     values |= dict.fromkeys(set(values) - set(m.names(force)))
     result = m.arrivals(force, **values, period=840.0, functions=41 if force != "resonator" else 3, cycles=4)
@@ -67,7 +67,7 @@ def test_every_force_has_the_covariance_that_is_said(force, variance):
 
 @pytest.mark.slow
 def test_steps_of_two_minutes_are_short_enough():
-    m, data = own(), loading.load("call-centre").simulate()
+    m, data = model_module(), loading.load("call-centre").simulate()
     values = {name: m.TRUTH[name] for name in m.names("matern")}
     system = m.build(**values, force="matern")
     coarse, fine = (float(lfm.MarginalLikelihood(system, data.times, steps=steps).log_prob(data.y))
@@ -86,7 +86,7 @@ def test_readings_become_logarithms():
 
 
 def test_impossible_rates_and_periods_are_refused_and_overloads_warned_of():
-    m, file = own(), loading.load("call-centre")
+    m, file = model_module(), loading.load("call-centre")
     values = dict(mean=6.0, scale=2.0, noise_sd=0.5, lengthscale=100.0, memory=10.0)
     for options, name in (({"service": -5.0}, "service rate"),
                           ({"service": lfm.Input([0.0, 1.0], [10.0, -1.0])}, "rate"),

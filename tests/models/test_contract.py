@@ -71,8 +71,9 @@ def test_the_truth_of_the_default_data_is_possible_and_near_the_best(name, optio
         assert np.all(trace[key]["fn"].support(np.asarray(parameters[key]))), f"the true {key} is possible"
     density = jax.jit(lambda values: log_density(file.model, (data.times, data.y), keywords, values)[0])
     truth = {key: np.asarray(parameters[key], float) for key in sampled}
-    best, *others = (float(density({key: value * factor for key, value in truth.items()})) for factor in (1, 0.5, 2))
-    assert np.isfinite(best) and best > max(others) - 30.0
+    best, *other_densities = (float(density({key: value * factor for key, value in truth.items()}))
+                              for factor in (1, 0.5, 2))
+    assert np.isfinite(best) and best > max(other_densities) - 30.0
 
 
 @pytest.mark.parametrize("name", [

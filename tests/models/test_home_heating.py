@@ -50,7 +50,7 @@ def test_the_expected_temperatures_solve_the_equations(envelope):
     ("SQM", 5, (24.0, 48.0, 72.0, 96.0)), ("WQM", 5, (24.0, 48.0, 72.0, 96.0)), ("CQM", 5, ()), ("periodic", 5, ()),
     ("matern", 1, ()), ("resonator", 9, ()), ("none", 0, ())])
 def test_residuals_are_what_they_are_called(residual, states, jumps):
-    """Of two days; the midnights of two more are those of a forecast."""
+    """Over two days; the midnights of two more days belong to a forecast."""
     model = system(np.arange(49.0), residual=residual)
     assert model.force_names == (("weather", "residual") if states else ("weather",))
     if not states:

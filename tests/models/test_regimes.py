@@ -37,8 +37,8 @@ def test_a_figure_has_one_panel_for_all_regimes_also_of_a_forecast_and_of_a_choi
     states = result["trajectories"]["states"].sel(state=["cold", "warm"])
     np.testing.assert_allclose(states.sum("state"), 1.0)
     forecast = lfm.forecast(result, file.model, np.array([0.5, 1.0]), progress=False)
-    for shown, count in ((result, 2), (forecast, 2)):
-        figure = lfm.plot_states(shown)
+    for source, count in ((result, 2), (forecast, 2)):
+        figure = lfm.plot_states(source)
         assert isinstance(figure, Figure)
         assert [axes.get_ylabel() for axes in figure.axes][1:] == ["probability"] and len(figure.axes) == count
         labels = [text.get_text() for text in figure.axes[1].get_yticklabels()]

@@ -137,8 +137,8 @@ def test_p53_posterior(file):
     forces = ResultView.of(nuts).group("trajectories")["forces"].isel(force=0)
     peak = forces["time"].values[forces.mean(["chain", "draw"]).values.argmax()]
     assert peak < 6.0
-    each = forces["time"].values[forces.values.argmax(axis=forces.dims.index("time"))]
-    assert np.mean(each < 6.0) > 0.9
+    peak_times = forces["time"].values[forces.values.argmax(axis=forces.dims.index("time"))]
+    assert np.mean(peak_times < 6.0) > 0.9
 
 
 def log_evidence(parameters, times, y, link_function, samples=200_000):
@@ -151,25 +151,25 @@ def log_evidence(parameters, times, y, link_function, samples=200_000):
     unique = np.unique(times)
     node, weight = np.polynomial.legendre.leggauss(14)
     half, middle = np.diff(unique) / 2, (unique[1:] + unique[:-1]) / 2
-    at, weight = (middle[:, None] + half[:, None] * node).ravel(), (half[:, None] * weight).ravel()
-    lag = np.sqrt(3.0) / parameters["lengthscale"] * np.abs(at[:, None] - at)
+    nodes, weight = (middle[:, None] + half[:, None] * node).ravel(), (half[:, None] * weight).ravel()
+    lag = np.sqrt(3.0) / parameters["lengthscale"] * np.abs(nodes[:, None] - nodes)
     prior = parameters["scale"] ** 2 * (1 + lag) * np.exp(-lag)
-    root = jnp.asarray(np.linalg.cholesky(prior + 1e-9 * np.eye(at.size)))
-    maps, rests, constant = [], [], 0.0
+    root = jnp.asarray(np.linalg.cholesky(prior + 1e-9 * np.eye(nodes.size)))
+    maps, whitened_residuals, constant = [], [], 0.0
     for gene, values in enumerate(y.T):
-        there = np.isfinite(values)
-        when, decay = times[there], parameters["decay"][gene]
-        response = weight * np.exp(-decay * np.maximum(when[:, None] - at, 0.0)) * (at < when[:, None])
+        is_observed = np.isfinite(values)
+        when, decay = times[is_observed], parameters["decay"][gene]
+        response = weight * np.exp(-decay * np.maximum(when[:, None] - nodes, 0.0)) * (nodes < when[:, None])
         start = 0.1 * np.exp(-decay * (when - unique[0]))
         noise = np.outer(start, start) + parameters["noise_sd"][gene] ** 2 * np.eye(when.size)
         factor = np.linalg.cholesky(noise)
         maps.append(np.linalg.solve(factor, parameters["sensitivity"][gene] * response))
-        rests.append(np.linalg.solve(factor, values[there] - parameters["basal"][gene] / decay))
+        whitened_residuals.append(np.linalg.solve(factor, values[is_observed] - parameters["basal"][gene] / decay))
         constant -= np.log(np.diag(factor)).sum() + 0.5 * when.size * np.log(2 * np.pi)
-    response, rest = jnp.asarray(np.concatenate(maps)), jnp.asarray(np.concatenate(rests))
+    response, whitened_residual = jnp.asarray(np.concatenate(maps)), jnp.asarray(np.concatenate(whitened_residuals))
 
     def residual(z):
-        return rest - link_function(z @ root.T) @ response.T
+        return whitened_residual - link_function(z @ root.T) @ response.T
 
     @jax.jit
     def log_joint(z):
@@ -178,10 +178,10 @@ def log_evidence(parameters, times, y, link_function, samples=200_000):
     @jax.jit
     def newton(z):
         jacobian = jax.jacobian(residual)(z)
-        precision = jacobian.T @ jacobian + jnp.eye(at.size)
+        precision = jacobian.T @ jacobian + jnp.eye(nodes.size)
         return jnp.linalg.solve(precision, jax.grad(log_joint)(z)), precision
 
-    mean = jnp.zeros(at.size)
+    mean = jnp.zeros(nodes.size)
     for _ in range(100):
         step, precision = newton(mean)
         share = next(share for share in (*0.5 ** np.arange(30), 0.0)
@@ -191,7 +191,7 @@ def log_evidence(parameters, times, y, link_function, samples=200_000):
     random = np.random.default_rng(0)
     for _ in range(3):
         factor = np.linalg.cholesky(covariance)
-        draws = random.standard_normal((samples, at.size))
+        draws = random.standard_normal((samples, nodes.size))
         points = mean + draws @ factor.T
         log_weights = np.asarray(log_joint(points)) + 0.5 * (draws**2).sum(1) + np.log(np.diag(factor)).sum()
         weights = np.exp(log_weights - log_weights.max())

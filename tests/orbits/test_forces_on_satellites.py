@@ -29,9 +29,9 @@ def gradient(potential, r, h=1.0):
     total = np.zeros(3)
     for axis in range(3):
         unit = h * np.eye(3)[axis]
-        near = potential(r + unit) - potential(r - unit)
-        far = potential(r + 2 * unit) - potential(r - 2 * unit)
-        total[axis] = (8 * near - far) / (12 * h)
+        inner_difference = potential(r + unit) - potential(r - unit)
+        outer_difference = potential(r + 2 * unit) - potential(r - 2 * unit)
+        total[axis] = (8 * inner_difference - outer_difference) / (12 * h)
     return total
 
 
@@ -49,8 +49,8 @@ def potential(r, degree):
 def test_gravity_is_the_gradient_of_the_potential(degree):
     for r in PLACES:
         result = np.asarray(ACCELERATION(r, degree))
-        whole = gradient(lambda p: potential(p, degree), r)
-        assert np.abs(result - whole).max() < 1e-8 * np.linalg.norm(whole)
+        expected = gradient(lambda p: potential(p, degree), r)
+        assert np.abs(result - expected).max() < 1e-8 * np.linalg.norm(expected)
         if degree == 0:
             np.testing.assert_allclose(result, -geopotential.GM * r / np.linalg.norm(r) ** 3, rtol=1e-14)
 
@@ -66,8 +66,8 @@ def test_a_body_pulls_the_satellite_more_than_the_earth():
     attraction = jax.jit(bodies.attraction)
     for r, body in itertools.product(PLACES, (SUN, MOON)):
         wide = [np.array(a, np.longdouble) for a in (r, body)]
-        away = wide[1] - wide[0]
-        expected = away / np.sqrt((away**2).sum()) ** 3 - wide[1] / np.sqrt((wide[1] ** 2).sum()) ** 3
+        separation = wide[1] - wide[0]
+        expected = separation / np.sqrt((separation**2).sum()) ** 3 - wide[1] / np.sqrt((wide[1] ** 2).sum()) ** 3
         np.testing.assert_allclose(attraction(r, body, 1.0), expected.astype(float), rtol=1e-11,
                                    atol=1e-14 * float(np.abs(expected).max()))
 
@@ -94,9 +94,9 @@ def test_sunlight_is_the_visible_part_of_the_disc():
     sun = np.array([1.496e8, 0.0, 0.0])
     # Behind the Earth, on a circle of 26,560 km, through the whole penumbra.
     angles = np.linspace(0.2355, 0.2495, 57)
-    places = 26_560.0 * np.stack([-np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
-    result, expected = np.asarray(jax.jit(jax.vmap(bodies.sunlight, (0, None)))(places, sun)), []
-    for r in places:
+    positions = 26_560.0 * np.stack([-np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    result, expected = np.asarray(jax.jit(jax.vmap(bodies.sunlight, (0, None)))(positions, sun)), []
+    for r in positions:
         to_sun, to_earth = sun - r, -r
         between = np.arccos(to_sun @ to_earth / np.linalg.norm(to_sun) / np.linalg.norm(to_earth))
         a, b = np.arcsin(bodies.SUN_RADIUS / np.linalg.norm(to_sun)), np.arcsin(geopotential.RADIUS / 26_560.0)
@@ -125,11 +125,11 @@ def test_earth_rotation_equals_pyerfa():
     turn = jax.jit(lambda t: rotation(t))
     for hours in np.random.default_rng(0).uniform(0.0, 240.0, 20):
         seconds = np.array([EPOCH + 3600.0 * hours])
-        now, tt = earth.orientation(seconds), times.terrestrial(seconds)
+        orientation, tt = earth.orientation(seconds), times.terrestrial(seconds)
         x, y, s = erfa.xys06a(*tt)
-        ut1 = erfa.utcut1(*times.utc(seconds), now.ut1_minus_utc)
-        expected = erfa.c2tcio(erfa.c2ixys(x + now.dx, y + now.dy, s), erfa.era00(*ut1),
-                               erfa.pom00(now.x, now.y, erfa.sp00(*tt)))[0]
+        ut1 = erfa.utcut1(*times.utc(seconds), orientation.ut1_minus_utc)
+        expected = erfa.c2tcio(erfa.c2ixys(x + orientation.dx, y + orientation.dy, s), erfa.era00(*ut1),
+                               erfa.pom00(orientation.x, orientation.y, erfa.sp00(*tt)))[0]
         assert 26_560e3 * np.abs(turn(hours) - expected).max() < 1e-3  # metres; 5 cm are asked for
 
 
@@ -150,8 +150,8 @@ def test_utc_jumps_and_ut1_does_not():
     result = earth.orientation(seconds)
     first, second = times.utc(seconds)
     ut1 = sum(erfa.utcut1(first, second, result.ut1_minus_utc)) - times.GPS_START - 13_510.0
-    ahead = (ut1 - (seconds - orbits.gps_seconds(2017, 1, 1)) / 86_400.0) * 86_400.0
-    assert np.ptp(ahead) < 1e-3 and result.ut1_minus_utc[-1] - result.ut1_minus_utc[0] == pytest.approx(1.0, abs=1e-3)
+    offset = (ut1 - (seconds - orbits.gps_seconds(2017, 1, 1)) / 86_400.0) * 86_400.0
+    assert np.ptp(offset) < 1e-3 and result.ut1_minus_utc[-1] - result.ut1_minus_utc[0] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_gps_time_is_not_utc():

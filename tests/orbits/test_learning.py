@@ -104,16 +104,16 @@ def satellite():
 @pytest.mark.slow
 def test_departures_are_predicted_as_the_satellite_itself(satellite):
     """The linear model of departures, in steps fifteen times as long, against the filter of the satellite."""
-    one, axes = satellite, "DYB"
-    orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
-    near = prediction.surroundings(one, orbit, axes)
+    arc, axes = satellite, "DYB"
+    orbit = orbits.fit_orbit(arc.environment, arc.times[:arc.train], arc.positions[:arc.train])
+    neighbourhood = prediction.surroundings(arc, orbit, axes)
     vector = magnitudes.wide(axes).mean
-    mean, covariance = prediction.filter_positions(one, orbit, vector, axes, one.learnt())
-    result = prediction.predict(one, near, vector[None])
-    after = slice(one.train, None)
-    sd = np.sqrt(np.diagonal(covariance[after], axis1=1, axis2=2))
-    assert np.abs(result.state[after, :3] - mean[after]).max() < 2e-2 * sd.min()
-    assert np.abs(result.covariance[after] / covariance[after] - 1)[:, [0, 1, 2], [0, 1, 2]].max() < 1e-2
+    mean, covariance = prediction.filter_positions(arc, orbit, vector, axes, arc.learnt())
+    result = prediction.predict(arc, neighbourhood, vector[None])
+    horizon = slice(arc.train, None)
+    sd = np.sqrt(np.diagonal(covariance[horizon], axis1=1, axis2=2))
+    assert np.abs(result.state[horizon, :3] - mean[horizon]).max() < 2e-2 * sd.min()
+    assert np.abs(result.covariance[horizon] / covariance[horizon] - 1)[:, [0, 1, 2], [0, 1, 2]].max() < 1e-2
 
 
 BEGIN, COUNT, GROWTH = 10.25, 11, 0.1
@@ -132,7 +132,7 @@ def freely(request):
         along[:, 9] = orbits.NANO * random.normal(size=3)
     table = TimeTable(BEGIN, 1.0, (1 + GROWTH * np.arange(8.0)[:, None]) * along.ravel())
     on_orbit = 90.0 * np.eye(along.shape[1] - 6)[0]
-    near = orbits.Neighbourhood(np.zeros((COUNT, 6)), table, on_orbit, axes, orbits.GPS_PERIOD)
+    neighbourhood = orbits.Neighbourhood(np.zeros((COUNT, 6)), table, on_orbit, axes, orbits.GPS_PERIOD)
     # Forces and noises that move a satellite by far more than its positions' noise within hours.
     larger = {"level": 100.0, "amplitude": 100.0, "drift": 1e4, "wander": 30.0, "white": 1e3}
     vector = (magnitudes.wide(axes).mean + 0.3 * random.normal(size=len(magnitudes.names(axes)))
@@ -140,7 +140,7 @@ def freely(request):
     mean, covariance = moments(times - BEGIN, axes, along[:, 6:], on_orbit, vector)
     y = (mean + np.linalg.cholesky(covariance) @ random.normal(size=3 * COUNT)).reshape(-1, 3)
     y[4] = y[8, 1] = np.nan
-    return training.Training.along(near, times, y, axes), vector, mean, covariance
+    return training.Training.along(neighbourhood, times, y, axes), vector, mean, covariance
 
 
 def moments(times, axes, along, on_orbit, vector):
@@ -181,19 +181,19 @@ def test_densities_of_positions_are_those_of_a_gaussian(freely):
     """Covariances by quadrature of the forces' covariance functions, densities by SciPy."""
     data, vector, mean, covariance = freely
     y = data.y.ravel()
-    known = np.isfinite(y)
-    expected = stats.multivariate_normal.logpdf(y[known], mean[known], covariance[np.ix_(known, known)])
+    present = np.isfinite(y)
+    expected = stats.multivariate_normal.logpdf(y[present], mean[present], covariance[np.ix_(present, present)])
     assert float(training.log_likelihood(vector, data.regression, data.axes)) == pytest.approx(expected, rel=1e-5)
     total = 0.0
     for seen in (3, 7):
-        some = np.flatnonzero(known & (np.arange(len(y)) < 3 * seen))
+        some = np.flatnonzero(present & (np.arange(len(y)) < 3 * seen))
         rows = []
         for row in (row for row in range(seen, COUNT) if np.isfinite(data.y[row]).all()):
-            at = np.arange(3 * row, 3 * row + 3)
-            gain = np.linalg.solve(covariance[np.ix_(some, some)], covariance[np.ix_(some, at)]).T
+            columns = np.arange(3 * row, 3 * row + 3)
+            gain = np.linalg.solve(covariance[np.ix_(some, some)], covariance[np.ix_(some, columns)]).T
             rows.append(stats.multivariate_normal.logpdf(
-                y[at], mean[at] + gain @ (y - mean)[some],
-                covariance[np.ix_(at, at)] - gain @ covariance[np.ix_(some, at)]))
+                y[columns], mean[columns] + gain @ (y - mean)[some],
+                covariance[np.ix_(columns, columns)] - gain @ covariance[np.ix_(some, columns)]))
         total += np.mean(rows)
     assert float(training.held_out(vector, data.regression, data.axes)) == pytest.approx(total, rel=1e-5)
 
@@ -215,12 +215,12 @@ def test_magnitudes_beyond_numbers_have_minus_infinity_and_zero_slopes(freely, s
 @pytest.fixture(scope="module", params=["DYB", "RTN"])
 def learning_from(request, satellite):
     """The training of the simulated satellite, one position missing, and magnitudes."""
-    one, axes = satellite, request.param
-    positions = one.positions.copy()
+    arc, axes = satellite, request.param
+    positions = arc.positions.copy()
     positions[10] = np.nan
-    one = one._replace(positions=positions)
-    orbit = orbits.fit_orbit(one.environment, one.times[:one.train], one.positions[:one.train])
-    return training.Training.of(one, orbit, axes), magnitudes.wide(axes).mean + 0.1
+    arc = arc._replace(positions=positions)
+    orbit = orbits.fit_orbit(arc.environment, arc.times[:arc.train], arc.positions[:arc.train])
+    return training.Training.of(arc, orbit, axes), magnitudes.wide(axes).mean + 0.1
 
 
 @pytest.mark.slow

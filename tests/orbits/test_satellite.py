@@ -34,8 +34,8 @@ def kepler(state, hours, gm):
     e_cos, e_sin = 1 - np.linalg.norm(r) / a, r @ v / np.sqrt(gm * a)
     change = n * hours
     for _ in range(50):
-        left = change - e_cos * np.sin(change) + e_sin * (1 - np.cos(change)) - n * hours
-        change -= left / (1 - e_cos * np.cos(change) + e_sin * np.sin(change))
+        residual = change - e_cos * np.sin(change) + e_sin * (1 - np.cos(change)) - n * hours
+        change -= residual / (1 - e_cos * np.cos(change) + e_sin * np.sin(change))
     f = 1 - a / np.linalg.norm(r) * (1 - np.cos(change))
     g = hours - (change - np.sin(change)) / n
     return f * r + g * v
@@ -106,8 +106,8 @@ def test_points_are_placed_in_position_and_velocity_alone(around, axes, states):
     start = lfm.Gaussian(jnp.asarray(START), 1e-2 * jnp.eye(6))
     ssm = state_space(orbits.satellite(around, start, orbits.small_forces(axes), axes, white=0.1))
     assert ssm.state_dim == states
-    wanted = (0, 1, 2) if axes == "DYB" else (0, 1, 2, 3, 4, 5)
-    assert tuple(ssm.drift_structure.nonlinear) == wanted
+    expected = (0, 1, 2) if axes == "DYB" else (0, 1, 2, 3, 4, 5)
+    assert tuple(ssm.drift_structure.nonlinear) == expected
 
 
 @pytest.mark.parametrize(("axes", "turns"), [("DYB", 1), ("RTN", 2)])
@@ -115,7 +115,7 @@ def test_resonators_have_multiples_of_the_frequency_of_the_orbit_or_of_half_of_i
     for force, (name, multiples) in zip(orbits.small_forces(axes, period=14.08).values(),
                                         orbits.HARMONICS[axes].items() if axes == "DYB"
                                         else [("solar", ()), *orbits.HARMONICS[axes].items()], strict=True):
-        periods = [float(one.period) for one in getattr(force, "forces", ()) if hasattr(one, "period")]
+        periods = [float(part.period) for part in getattr(force, "forces", ()) if hasattr(part, "period")]
         np.testing.assert_allclose(periods, [turns * 14.08 / n for n in multiples], err_msg=name)
 
 
@@ -151,8 +151,8 @@ def test_start_of_an_orbit_from_positions(around):
     assert np.abs(result.mean - START)[:3].max() < 1e-9 and np.abs(result.mean - START)[3:].max() < 1e-3
     holes = truth[:, :3].copy()
     holes[[2, 5]] = np.nan
-    near = np.abs(orbits.start_near(TIMES, holes).mean - START)
-    assert near[:3].max() < 1e-9 and near[3:].max() < 0.1 * orbits.START_SD[1]
+    error = np.abs(orbits.start_near(TIMES, holes).mean - START)
+    assert error[:3].max() < 1e-9 and error[3:].max() < 0.1 * orbits.START_SD[1]
     for missing in ([0], [2, 3, 4, 5, 6]):
         holes = truth[:, :3].copy()
         holes[missing] = np.nan
@@ -165,14 +165,14 @@ def test_departures_follow_two_orbits_that_differ_a_little(around):
     """The linear model against the difference of two paths, whose start and sunlight differ."""
     first = orbits.Orbit(0.0, START, 100.0, 0.0)
     change = np.array([2e-3, -1e-3, 3e-3, 1e-3, -2e-3, 1e-3])
-    other = orbits.propagate(around, orbits.Orbit(0.0, START + change, 102.0, 0.0), TIMES)
-    near = orbits.Neighbourhood.of(around, first, TIMES, nodes=8)
+    second = orbits.propagate(around, orbits.Orbit(0.0, START + change, 102.0, 0.0), TIMES)
+    neighbourhood = orbits.Neighbourhood.of(around, first, TIMES, nodes=8)
     forces = {"solar": lfm.Constant(1e-9, mean=102.0), "panel": lfm.Constant(1e-9), "remaining": lfm.Constant(1e-9)}
-    model = orbits.departure(near, forces, start=lfm.Gaussian(jnp.asarray(change), jnp.zeros((6, 6))))
+    model = orbits.departure(neighbourhood, forces, start=lfm.Gaussian(jnp.asarray(change), jnp.zeros((6, 6))))
     nothing = np.full((len(TIMES), 3), np.nan)
     nothing[0] = change[:3]
     result = lfm.filter(model, TIMES, nothing, rule=lfm.Taylor(), steps=4).filtered_mean[:, :6]
-    apart = other - np.asarray(near.path)
+    apart = second - np.asarray(neighbourhood.path)
     assert np.abs(result - apart).max() < 1e-4 * np.abs(apart).max()
 
 
@@ -186,8 +186,8 @@ def test_the_table_of_a_neighbourhood_holds_means():
     weights[[0, -1]] = 1 / 3
     for edge in np.linspace(10.0, 12.0, 17):
         jump = (t[:, None] >= edge).astype(float)
-        whole = 0.5 * (jump[1:] + jump[:-1]).sum() / finer
-        assert weights @ deviations._means(jump, finer)[:, 0] == pytest.approx(whole, abs=1e-12)
+        expected = 0.5 * (jump[1:] + jump[:-1]).sum() / finer
+        assert weights @ deviations._means(jump, finer)[:, 0] == pytest.approx(expected, abs=1e-12)
     plain = [weights @ (t[::finer] >= edge) - (30.0 - edge) for edge in np.linspace(10.0, 12.0, 17)]
     assert np.abs(plain).max() > 0.6
     few = np.arange(3.0 * finer + 1)[:, None]  # nothing is averaged in a table as short as this

@@ -1,4 +1,4 @@
-"""SP3 files: what is read, how days connect, and what a user is told about files that cannot be read."""
+"""SP3 files: what is read, how days connect, and the messages about files that cannot be read."""
 
 import gzip
 import os
@@ -104,7 +104,7 @@ def test_more_satellites_than_fit_a_line_of_the_header(write, version):
 
 @pytest.mark.parametrize("change", [
     lambda line: line + "  \r", lambda line: line.replace("G05", "G 5"), *(
-        lambda line, rest=rest: line[:46] + rest if line.startswith("P") else line for rest in (
+        lambda line, ending=ending: line[:46] + ending if line.startswith("P") else line for ending in (
             "", "     -4.812044 19 18 17 219 EP  MP", f"{'':14} 19 18 17{'':9}MP", f"{'':32}MP", " 999999.9999"))])
 def test_other_spellings_of_the_same(write, change):
     """Windows' line ends, names with a blank, and whatever follows a position."""
@@ -152,9 +152,9 @@ def test_days_connect_in_any_order_and_satellites_come_and_go(write, tmp_path):
     assert [str(gap) for gap in orbits.gaps("G06")] == [
         "2019-04-07 00:00:00 to 2019-04-07 18:00:00 GPS", "2019-04-09 00:00:00 to 2019-04-09 18:00:00 GPS"]
     assert orbits.gaps("G05") == []
-    chosen = read_sp3(tmp_path, satellites=["G32", "G06"])
-    np.testing.assert_array_equal(chosen.positions, orbits.select(["G32", "G06"]).positions)
-    assert chosen.satellites == orbits.select(["G32", "G06"]).satellites == ("G32", "G06")
+    selection = read_sp3(tmp_path, satellites=["G32", "G06"])
+    np.testing.assert_array_equal(selection.positions, orbits.select(["G32", "G06"]).positions)
+    assert selection.satellites == orbits.select(["G32", "G06"]).satellites == ("G32", "G06")
 
 
 def flagged(lines, flags):
@@ -172,10 +172,10 @@ PREDICTED, MANOEUVRE, CLOCK = " " * 15 + "P   P", " " * 18 + "M", " " * 14 + "EP
 def test_predicted_positions_and_manoeuvres_are_left_out_unless_they_are_named(write, recwarn):
     path = write(flagged(sp3(), {("PG05", 1): MANOEUVRE, ("PG05", 2): PREDICTED, ("PG05", 3): PREDICTED,
                                  ("PG32", 1): PREDICTED[:-1] + "  ", ("PE01", 3): CLOCK}))
-    whole = circle(START + STEP * np.arange(4), ["E01", "G05", "G32"])
+    all_positions = circle(START + STEP * np.arange(4), ["E01", "G05", "G32"])
     for include, rows in (([], [1, 2, 3]), (["predicted"], [1]), (["manoeuvres"], [2, 3]),
                           (["manoeuvres", "predicted"], [])):
-        expected = whole.copy()
+        expected = all_positions.copy()
         expected[rows, 1] = np.nan
         np.testing.assert_array_equal(read_sp3(path, include=include).positions, expected)
     messages = [str(warning.message) for warning in recwarn]

@@ -63,10 +63,10 @@ def test_the_double_well_agrees_with_the_grid():
     """Both methods; Euler's steps of 1/50 leave an error below the Monte Carlo error."""
     model, times = double_well(mean=0.0), np.array([0.0, 1.5, 3.0, 4.0])
     y = np.array([[0.8], [0.1], [-0.9], [-0.8]])
-    at = np.array([0.75, 1.5, 2.25, 4.0])
-    exact = fokker_planck(model, times, y, at=at)
+    grid = np.array([0.75, 1.5, 2.25, 4.0])
+    exact = fokker_planck(model, times, y, at=grid)
     for method, particles, draws in (("backward simulation", 3000, 1000), ("ancestor tracing", 40_000, 4000)):
-        result = lfm.particle_smoother(jax.random.key(2), model, times, y, particles=particles, draws=draws, at=at,
+        result = lfm.particle_smoother(jax.random.key(2), model, times, y, particles=particles, draws=draws, at=grid,
                                        steps=75, method=method)
         assert result.method == method
         count = draws / 2 if method.startswith("back") else float(result.distinct.min()) / 4

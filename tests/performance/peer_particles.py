@@ -1,4 +1,4 @@
-"""The double well in the `particles` package: prints seconds for a scheme. It needs NumPy 1, so it runs by itself.
+"""The double well in the `particles` package: prints seconds for a scheme. It needs NumPy 1, so it runs alone.
 
     python peer_particles.py srk 40000 25 100
 """
@@ -37,7 +37,7 @@ class Transition(distributions.ProbDist):
         return x
 
 
-class DoubleWell(state_space_models.StateSpaceModel):
+class ObservedDoubleWell(state_space_models.StateSpaceModel):
     """dx = (x - 0.1 x^3) dt + 2 dB, observed with noise of standard deviation 0.1."""
 
     def PX0(self):  # noqa: N802 (names of the package)
@@ -51,7 +51,7 @@ class DoubleWell(state_space_models.StateSpaceModel):
 
 
 y = 3.0 * np.sign(np.sin(0.4 * np.arange(OBSERVATIONS) + 0.1))
-model = state_space_models.Bootstrap(ssm=DoubleWell(), data=y)
+model = state_space_models.Bootstrap(ssm=ObservedDoubleWell(), data=y)
 best = np.inf
 for _ in range(3):
     run = particles.SMC(fk=model, N=PARTICLES, resampling="systematic")

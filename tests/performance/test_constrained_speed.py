@@ -79,7 +79,7 @@ def seconds(run, *arguments):
 
 def test_a_pass_takes_at_most_one_and_a_half_smoother_passes():
     times, y = data(1501, SHAPES["sine"])
-    given = problem(times, y)
+    smoothing_problem = problem(times, y)
     ssm = state_space(MODEL)
     grid = build_time_grid(ssm, times, 1)
 
@@ -89,20 +89,21 @@ def test_a_pass_takes_at_most_one_and_a_half_smoother_passes():
         return backward(problem, forward(problem, GaussianUpdate(y), record=Record.SMOOTHER))
 
     solve = eqx.filter_jit(solve_linear)
-    passes = int(solve(given, 1e-10, 100).passes)
-    ratio = seconds(solve, given, 1e-10, 100) / passes / seconds(smoother, ssm, grid, jnp.asarray(y))
+    passes = int(solve(smoothing_problem, 1e-10, 100).passes)
+    ratio = seconds(solve, smoothing_problem, 1e-10, 100) / passes / seconds(smoother, ssm, grid, jnp.asarray(y))
     print(f"\na pass takes {ratio:.2f} smoother passes, {passes} passes")
     assert ratio <= 1.5
 
 
 def test_linear_in_time():
-    solve = eqx.filter_jit(lambda given, targets: smoother_pass(given, targets, jnp.ones_like(targets))[2])
-    taken = {}
+    solve = eqx.filter_jit(
+        lambda smoothing_problem, targets: smoother_pass(smoothing_problem, targets, jnp.ones_like(targets))[2])
+    durations = {}
     for count in (2_000, 20_000):
         times, y = data(count, SHAPES["sine"])
-        taken[count] = seconds(solve, problem(times, y), jnp.zeros((count, 1)))
-    print(f"\n{taken}")
-    assert taken[20_000] <= 15.0 * taken[2_000]
+        durations[count] = seconds(solve, problem(times, y), jnp.zeros((count, 1)))
+    print(f"\n{durations}")
+    assert durations[20_000] <= 15.0 * durations[2_000]
 
 
 def test_100_000_rows():

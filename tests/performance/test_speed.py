@@ -44,11 +44,11 @@ def iterated(theta):
 def forward(function):
     """Value and gradient in forward mode."""
 
-    def both(theta):
+    def value_and_gradient(theta):
         values, gradient = jax.vmap(lambda direction: jax.jvp(function, (theta,), (direction,)))(jnp.eye(theta.size))
         return values[0], gradient
 
-    return both
+    return value_and_gradient
 
 
 RATES = np.array([0.1, 0.1, 0.1, 0.7, 0.5, 0.4, 0.5, 1.0, 1.5, 2.0])
@@ -78,9 +78,9 @@ def best(benchmark, run):
 def test_value(benchmark, system):
     function, theta = SYSTEMS[system]
     compiled, theta = jax.jit(function), jnp.asarray(theta)
-    took = best(benchmark, lambda: compiled(theta).block_until_ready())
+    duration = best(benchmark, lambda: compiled(theta).block_until_ready())
     assert np.isfinite(compiled(theta))
-    assert took < BOUNDS[system, "value"]
+    assert duration < BOUNDS[system, "value"]
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
@@ -177,10 +177,10 @@ def test_counts_against_measurements(count):
     thetas = [jnp.asarray(theta) for theta in 0.3 * rng.normal(size=(8, 3))]
     seconds = np.zeros((20, 2))
     for round_ in range(-1, 20):
-        for index, both in enumerate(compiled):
+        for index, evaluate in enumerate(compiled):
             begin = time.process_time()
-            jax.block_until_ready([both(theta) for theta in thetas])
+            jax.block_until_ready([evaluate(theta) for theta in thetas])
             seconds[round_, index] = time.process_time() - begin  # the first round compiles, and is written over
-    taken = np.median(seconds, axis=0)
-    print(count, 1e3 * taken / len(thetas), taken[1] / taken[0])
-    assert taken[1] < 12.0 * taken[0]
+    durations = np.median(seconds, axis=0)
+    print(count, 1e3 * durations / len(thetas), durations[1] / durations[0])
+    assert durations[1] < 12.0 * durations[0]

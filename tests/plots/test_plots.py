@@ -60,22 +60,22 @@ def predictions(datasets, time, last):
     """Predictions of outputs and forces at ``time``, with random draws."""
     rng = np.random.default_rng(2)
     outputs, forces = datasets["trajectories"]["output"], datasets["trajectories"]["force"]
-    place = ("chain", "draw", "time")
-    draws = {"forces": ((*place, "force"), rng.normal(size=(4, 25, len(time), len(forces))))}
+    sample_dims = ("chain", "draw", "time")
+    draws = {"forces": ((*sample_dims, "force"), rng.normal(size=(4, 25, len(time), len(forces))))}
     for name in ("y", "outputs"):
-        draws[name] = ((*place, "output"), rng.normal(size=(4, 25, len(time), len(outputs))))
+        draws[name] = ((*sample_dims, "output"), rng.normal(size=(4, 25, len(time), len(outputs))))
     return xr.Dataset(draws, {"time": time, "force": forces, "output": outputs}, {"last_observation": last})
 
 
 @pytest.mark.parametrize("plot", FIGURES)
 def test_readable_in_a_column_of_a_paper(result, readable, plot):
-    before = dict(matplotlib.rcParams)
+    settings = dict(matplotlib.rcParams)
     with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "black"}):
         figure = plot(result, width="column")
     readable(figure)
     assert figure.get_figwidth() == 3.4 and figure.get_figheight() < 10.0
     assert to_hex(figure.axes[0].get_facecolor()) == "#ffffff"
-    assert dict(matplotlib.rcParams) == before and not plt.get_fignums()
+    assert dict(matplotlib.rcParams) == settings and not plt.get_fignums()
     assert figure._repr_png_().startswith(b"\x89PNG")
 
 
@@ -102,8 +102,8 @@ def test_tick_labels_are_short_and_distinct(limits, power, labels):
     axes.set_xlim(*limits)
     assert style.scale(axes.xaxis) == power
     figure.draw_without_rendering()
-    shown = [text.get_text() for text in axes.get_xticklabels()]
-    assert len(set(shown)) == len(shown) and labels <= set(shown)
+    tick_labels = [text.get_text() for text in axes.get_xticklabels()]
+    assert len(set(tick_labels)) == len(tick_labels) and labels <= set(tick_labels)
 
 
 def test_names_are_whole():
@@ -135,12 +135,12 @@ def test_fit_draws_data_means_and_quantiles(result, datasets):
         for x, low, high in zip(outputs["time"].values, *np.quantile(draws, [0.025, 0.975], axis=0), strict=True):
             np.testing.assert_allclose(inner[x], [low, high])
         assert (min(outer), max(outer)) == (0.0, 12.0)
-        for at in np.unique(time):  # replicates are pooled
-            is_drawn = (predictive["time"] == at) & (predictive["output"] == observed["output"][index].item())
+        for instant in np.unique(time):  # replicates are pooled
+            is_drawn = (predictive["time"] == instant) & (predictive["output"] == observed["output"][index].item())
             if not is_drawn.any():
                 continue
             new = predictive.values[:, :, is_drawn.values]
-            np.testing.assert_allclose(outer[at], np.quantile(new, [0.025, 0.975]))
+            np.testing.assert_allclose(outer[instant], np.quantile(new, [0.025, 0.975]))
 
 
 def test_band_of_new_data_keeps_to_the_values_that_the_family_has(datasets):
@@ -149,9 +149,9 @@ def test_band_of_new_data_keeps_to_the_values_that_the_family_has(datasets):
     for values, kind in ((counts, "whole"), (counts + 0.001 * predictive["y"] ** 2, "positive")):
         new = predictive.assign(y=(predictive["y"].dims, np.asarray(values, float)))
         axes = plot_fit(arviz_data.build({**datasets, "posterior_predictive": new})).axes[0]
-        ends = np.array(list(edges(bands(axes)[0]).values()))
-        assert ends.min() >= 0.0
-        assert kind == "positive" or np.all(ends == np.round(ends))
+        bounds = np.array(list(edges(bands(axes)[0]).values()))
+        assert bounds.min() >= 0.0
+        assert kind == "positive" or np.all(bounds == np.round(bounds))
 
 
 def test_fit_of_one_row_and_without_predictive_draws(datasets):
@@ -183,19 +183,20 @@ def test_forces_states_and_deterministics_draw_means_bands_and_truth(datasets, p
 
 
 def test_the_truth_is_drawn_where_it_is_known_as_far_as_the_trajectories(datasets):
-    at, truth = datasets["trajectories"]["time"].values, datasets["truth"].sel(force=["stress"])
-    later = truth.assign_coords(time=truth["time"].values + 0.5 * np.ptp(at))
+    path_times, truth = datasets["trajectories"]["time"].values, datasets["truth"].sel(force=["stress"])
+    later = truth.assign_coords(time=truth["time"].values + 0.5 * np.ptp(path_times))
     without, axes = plot_forces(arviz_data.build({**datasets, "truth": later})).axes
     assert not lines(without, "truth")
-    drawn = the_line(axes, "truth").get_xdata()
-    assert 0 < len(drawn) < truth.sizes["time"] and at.min() <= drawn.min() and drawn.max() <= at.max()
+    truth_times = the_line(axes, "truth").get_xdata()
+    assert 0 < len(truth_times) < truth.sizes["time"]
+    assert path_times.min() <= truth_times.min() and truth_times.max() <= path_times.max()
 
 
 def test_bands_are_those_of_the_summary_where_there_is_one(datasets):
     paths = datasets["trajectories"]
     for name, kind, plot, band_index in (("forces", "force", plot_forces, 0), ("new_data", "output", plot_fit, 0)):
-        ends = np.stack([np.full((paths.sizes["time"], paths.sizes[kind]), value) for value in (0.5, -1.0, 2.0)])
-        summary = paths.assign({f"{name}_summary": (("statistic", "time", kind), ends)})
+        bounds = np.stack([np.full((paths.sizes["time"], paths.sizes[kind]), value) for value in (0.5, -1.0, 2.0)])
+        summary = paths.assign({f"{name}_summary": (("statistic", "time", kind), bounds)})
         axes = plot(arviz_data.build({**datasets, "trajectories": summary})).axes[1]
         band = edges(bands(axes)[band_index])
         assert set(band) == set(paths["time"].values)
@@ -209,27 +210,27 @@ def test_a_force_that_repeats_often_shows_its_last_periods(datasets):
     end = paths["time"].values[-1]
     assert the_line(p53, "posterior mean").get_xdata()[0] == paths["time"].values[0]
     assert end - 3.0 <= the_line(stress, "posterior mean").get_xdata()[0] < end - 2.5
-    ahead = predictions(datasets, np.linspace(13.0, 30.0, 80), 12.0)
-    stress = plot_forces(arviz_data.build({**datasets, "predictions": ahead})).axes[1]
+    forecast = predictions(datasets, np.linspace(13.0, 30.0, 80), 12.0)
+    stress = plot_forces(arviz_data.build({**datasets, "predictions": forecast})).axes[1]
     assert max(line.get_xdata()[-1] for line in lines(stress, "posterior mean")) <= end + 3.0
 
 
 def test_forecasts_continue_mean_and_bands_as_curves_or_bars(datasets):
     time = np.linspace(12.0, 30.0, 80)
-    ahead = predictions(datasets, time, 12.0)
-    figure = plot_forces(arviz_data.build({**datasets, "predictions": ahead}))
+    forecast = predictions(datasets, time, 12.0)
+    figure = plot_forces(arviz_data.build({**datasets, "predictions": forecast}))
     later = time > datasets["trajectories"]["time"].values[-1]
     for index, axes in enumerate(figure.axes):
-        drawn = edges(bands(axes)[-1])
-        bounds = np.quantile(ahead["forces"].values[..., index].reshape(-1, 80), (0.025, 0.975), axis=0)[:, later]
-        np.testing.assert_allclose([drawn[x] for x in time[later]], bounds.T)
+        band_edges = edges(bands(axes)[-1])
+        bounds = np.quantile(forecast["forces"].values[..., index].reshape(-1, 80), (0.025, 0.975), axis=0)[:, later]
+        np.testing.assert_allclose([band_edges[x] for x in time[later]], bounds.T)
         assert set(the_line(axes, "last observation").get_xdata()) == {12.0}
     for plot in (plot_forces, plot_fit):
-        axes = plot(arviz_data.build({**datasets, "predictions": ahead.isel(time=[0, -1])})).axes[0]
+        axes = plot(arviz_data.build({**datasets, "predictions": forecast.isel(time=[0, -1])})).axes[0]
         bars = [collection for collection in axes.collections if isinstance(collection, LineCollection)]
         assert all(np.all(segment[:, 0] == 30.0) for bar in bars for segment in bar.get_segments()) and bars
     alone = {name: datasets[name] for name in ("data",)}
-    axes = plot_fit(arviz_data.build({**alone, "predictions": ahead})).axes[0]
+    axes = plot_fit(arviz_data.build({**alone, "predictions": forecast})).axes[0]
     np.testing.assert_array_equal(the_line(axes, "posterior mean").get_xdata(), time)
 
 
@@ -237,18 +238,18 @@ def test_a_short_forecast_shows_the_last_rows_and_held_out_data(datasets):
     last, end = 12.0, 14.0
     paths = datasets["trajectories"]
     datasets["trajectories"] = paths.sel(time=paths["time"] <= last)
-    ahead = predictions(datasets, np.linspace(12.5, end, 5), last)
+    forecast = predictions(datasets, np.linspace(12.5, end, 5), last)
     y = xr.DataArray([[1.0, 2.0, 3.0], [1.5, np.nan, 2.5]], dims=("time", "output"))
     held_out = xr.Dataset({"y": y}, {"time": [13.0, 13.5], "output": datasets["data"]["output"]})
-    result = arviz_data.build({**datasets, "predictions": ahead, "held_out_data": held_out})
+    result = arviz_data.build({**datasets, "predictions": forecast, "held_out_data": held_out})
     axes = plot_fit(result).axes[1]
-    shown = the_line(axes, "data").get_xdata()
-    assert 0 < shown.min() <= last - 2 * (end - last) and shown.max() == last
+    data_times = the_line(axes, "data").get_xdata()
+    assert 0 < data_times.min() <= last - 2 * (end - last) and data_times.max() == last
     marks = the_line(axes, "held-out data")
     np.testing.assert_array_equal(marks.get_xydata(), [[13.0, 2.0], [13.5, np.nan]])
     assert marks.get_linestyle() == "None"
-    whole = plot_fit(forecasts.without_forecast(ResultView.of(result))).axes[1]
-    assert not lines(whole, "last observation") and the_line(whole, "data").get_xdata().min() == 0.0
+    fit_axes = plot_fit(forecasts.without_forecast(ResultView.of(result))).axes[1]
+    assert not lines(fit_axes, "last observation") and the_line(fit_axes, "data").get_xdata().min() == 0.0
 
 
 def test_doses_are_marked_and_their_rows_are_not_missing(datasets):
@@ -288,16 +289,16 @@ def test_known_inputs_are_drawn_as_they_are_read_and_held(result):
               "outside": InputTable(np.array([0.0, 24.0]), np.array([3.0, 5.0]), "linear")}
     with pytest.raises(ValueError, match="known inputs"):
         plot_inputs(result)
-    known = arviz_data.add_group(result, "constant_data", to_dataset(tables, {"outside": "degC"}))
-    figure = plot_inputs(known)
+    with_inputs = arviz_data.add_group(result, "constant_data", to_dataset(tables, {"outside": "degC"}))
+    figure = plot_inputs(with_inputs)
     assert [axes.get_ylabel() for axes in figure.axes] == ["heater", "outside (degC)"]
     assert [axes.lines[0].get_drawstyle() for axes in figure.axes] == ["steps-post", "default"]
-    ahead = xr.Dataset({"y": ("time", np.zeros(2))}, {"time": [8.0, 9.0]}, {"last_observation": 7.0})
-    axes = plot_inputs(arviz_data.add_group(known, "predictions", ahead)).axes[0]
+    forecast = xr.Dataset({"y": ("time", np.zeros(2))}, {"time": [8.0, 9.0]}, {"last_observation": 7.0})
+    axes = plot_inputs(arviz_data.add_group(with_inputs, "predictions", forecast)).axes[0]
     np.testing.assert_array_equal(axes.lines[0].get_xydata(), [[0.0, 0.0], [6.0, 2.0]])
     np.testing.assert_array_equal(the_line(axes, "held beyond its table").get_xydata(), [[6.0, 2.0], [9.0, 2.0]])
     with pytest.raises(ValueError, match="heatre.*heater"):
-        plot_inputs(known, "heatre")
+        plot_inputs(with_inputs, "heatre")
 
 
 def test_trace_and_ranks(result, datasets):
@@ -352,17 +353,17 @@ def test_residuals(result, datasets):
     assert len(figure.axes) == 9
     over_time, quantiles, lags = figure.axes[3:6]
     mean = datasets["one_step_ahead"]["residual"].values[..., 1].mean(axis=(0, 1))
-    there = mean[~np.isnan(mean)]
+    present = mean[~np.isnan(mean)]
     np.testing.assert_allclose(over_time.lines[-1].get_ydata(), mean)
-    dots, n = quantiles.lines[-1], len(there)
-    np.testing.assert_allclose(dots.get_ydata(), np.sort(there))
+    dots, n = quantiles.lines[-1], len(present)
+    np.testing.assert_allclose(dots.get_ydata(), np.sort(present))
     median = stats.norm.ppf(stats.beta.ppf(0.5, np.arange(1, n + 1), np.arange(n, 0, -1)))
     np.testing.assert_allclose(dots.get_xdata(), median)
     first = bands(quantiles)[0].get_paths()[0].vertices
     # The smallest of n uniform values has the quantile function 1 - (1 - p)^(1/n).
     low = stats.norm.ppf(1 - 0.975 ** (1 / n))
     np.testing.assert_allclose(first[first[:, 0] == first[:, 0].min(), 1].min(), low)
-    assert quantiles.get_title(loc="left") == f"KS p = {stats.kstest(there, 'norm').pvalue:.2g}"
+    assert quantiles.get_title(loc="left") == f"KS p = {stats.kstest(present, 'norm').pvalue:.2g}"
     assert lags.get_title(loc="left").startswith("Ljung-Box p = 0.")
 
 
@@ -389,8 +390,8 @@ def test_a_missing_group_is_named_with_its_source(datasets, plot, group):
         plot(arviz_data.build(datasets))
 
 
-@pytest.mark.parametrize("plot, wrong, near", [
+@pytest.mark.parametrize("plot, wrong, nearest", [
     (plot_fit, "CDKN1", "CDKN1A"), (plot_forces, "P53", "p53"), (plot_trace, "lengthscal", "lengthscale")])
-def test_an_unknown_name_gets_the_nearest_one(result, plot, wrong, near):
-    with pytest.raises(ValueError, match=rf"{wrong}.*'{near}'"):
+def test_an_unknown_name_gets_the_nearest_one(result, plot, wrong, nearest):
+    with pytest.raises(ValueError, match=rf"{wrong}.*'{nearest}'"):
         plot(result, [wrong])

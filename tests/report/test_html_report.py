@@ -191,12 +191,12 @@ def test_figures_are_drawn_and_a_failed_figure_is_named(groups, tmp_path, monkey
 def test_only_a_page_of_lfm_ppl_is_replaced(groups, attrs, tmp_path, capsys, monkeypatch):
     result = arviz_data.build(groups, attrs)
     path = save(groups, attrs, tmp_path)
-    before = path.read_bytes()
+    content = path.read_bytes()
     with pytest.raises(FileExistsError, match=r"report\.html"):
         save(groups, attrs, path)
     assert cli_page.report_failure(lambda: html_report.save_report(result, path, figures=())) == 1
     assert "report.html" in capsys.readouterr().err
-    assert path.read_bytes() == before
+    assert path.read_bytes() == content
     html_report.refuse_foreign(path, False)
     path.write_text("<html><p>my diary</p></html>")
     with pytest.raises(FileExistsError, match=r"report\.html"):

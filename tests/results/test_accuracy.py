@@ -62,13 +62,13 @@ def test_average_is_the_log_of_the_mean_with_the_variance_of_the_jackknife():
 def test_corrected_moments_are_right_within_calibrated_errors(coefficient, noise):
     """z-scores over 300 repetitions against the closed form: mean zero, sd one."""
     generator = np.random.default_rng(1)
-    chosen = np.linspace(0, 399, 100).round().astype(int)
+    indices = np.linspace(0, 399, 100).round().astype(int)
     scores = []
     for _ in range(300):
         x = autoregressive(generator, 4, 400, coefficient)
-        ratio = log_ratio(x[:, chosen]) + generator.normal(-0.5 * noise**2, noise, (4, len(chosen)))
+        ratio = log_ratio(x[:, indices]) + generator.normal(-0.5 * noise**2, noise, (4, len(indices)))
         weights = importance_weights.smooth(ratio)
-        row = importance_weights.corrected_moments({"x": x}, chosen, weights.log_weight).loc["x"]
+        row = importance_weights.corrected_moments({"x": x}, indices, weights.log_weight).loc["x"]
         sd = row["sd"]
         scores.append([(row["corrected_mean"] - TARGET_MEAN) / row["corrected_mean_se"],
                        (row["sd_ratio"] - TARGET_SD / WRONG_SD) / row["sd_ratio_se"],
@@ -81,11 +81,11 @@ def test_corrected_moments_are_right_within_calibrated_errors(coefficient, noise
 
 def test_without_a_difference_nothing_changes():
     x = np.random.default_rng(0).normal(size=(4, 100))
-    chosen = np.arange(0, 100, 10)
+    indices = np.arange(0, 100, 10)
     weights = importance_weights.smooth(np.full((4, 10), 2.5))
     assert weights.k == -np.inf and weights.reliable
     np.testing.assert_allclose(weights.ess, 40.0)
-    row = importance_weights.corrected_moments({"x": x, "fixed": np.ones((4, 100))}, chosen, weights.log_weight)
+    row = importance_weights.corrected_moments({"x": x, "fixed": np.ones((4, 100))}, indices, weights.log_weight)
     assert abs(row.loc["x", "shift"]) < 1e-12 and abs(row.loc["x", "sd_ratio"] - 1.0) < 1e-12
     assert row.loc["fixed"].tolist() == [1, 0, 1, 0, 0, 0, 1, 0, 0]
 
@@ -237,8 +237,8 @@ def test_particles_and_grid_agree(bent):
     bound = log_likelihoods.GRID_ERROR + 0.5 * noisy.noise_sd**2 + 4 * noisy.noise_sd / np.sqrt(400)
     assert abs(difference.mean()) < bound
     assert abs(difference.std() / noisy.noise_sd - 1.0) < 0.2  # 4 sd / sqrt(800), and the grid's error
-    both = noisy.table.loc["depth"], exact.table.loc["depth"]
-    assert abs(both[0]["shift"] - both[1]["shift"]) < 4 * both[0]["shift_se"]
+    rows = noisy.table.loc["depth"], exact.table.loc["depth"]
+    assert abs(rows[0]["shift"] - rows[1]["shift"]) < 4 * rows[0]["shift_se"]
 
 
 @pytest.mark.slow
@@ -271,9 +271,9 @@ def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     assert abs(row["corrected_sd"] / row["sd"] - posteriors["exact"][2] / posteriors["wrong"][2]) \
         < 3.5 * row["sd_ratio_se"] + 0.02
     corrected = correct_posterior(replaced, single_pass)
-    again = ResultView.of(corrected).posterior["depth"].values
-    assert again.shape == (4, 100) and set(again.ravel()) <= set(draws.ravel())
-    assert abs(again.mean() - posteriors["exact"][1]) < 4 * posteriors["exact"][2] / np.sqrt(report.ess)
+    depths = ResultView.of(corrected).posterior["depth"].values
+    assert depths.shape == (4, 100) and set(depths.ravel()) <= set(draws.ravel())
+    assert abs(depths.mean() - posteriors["exact"][1]) < 4 * posteriors["exact"][2] / np.sqrt(report.ess)
     assert ResultView.of(corrected).attrs["sampler"] == "nuts + importance resampling"
 
 
@@ -281,29 +281,29 @@ def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
 def test_the_report_survives_the_file(checked, tmp_path):
     result, report = checked
     path = arviz_data.save(result, tmp_path / "posterior.nc")
-    again = AccuracyReport.of(arviz_data.load(path))
-    xr.testing.assert_identical(report.to_dataset(), again.to_dataset())
-    assert str(again) == str(report) and again.verdict == report.verdict
-    assert again.table.equals(report.table)
+    loaded = AccuracyReport.of(arviz_data.load(path))
+    xr.testing.assert_identical(report.to_dataset(), loaded.to_dataset())
+    assert str(loaded) == str(report) and loaded.verdict == report.verdict
+    assert loaded.table.equals(report.table)
 
 
 @pytest.mark.thorough
 def test_densities_keep_to_the_support_and_their_mass_and_are_dashed_where_unreliable(checked):
     result, report = checked
     draws = np.abs(np.random.default_rng(0).normal(size=(1, 6000)))  # half a normal: densest at the end of its support
-    chosen = np.arange(0, 6000, 6000 // report.log_weight.size)[:report.log_weight.size]
+    indices = np.arange(0, 6000, 6000 // report.log_weight.size)[:report.log_weight.size]
     for k, dashed in ((0.1, False), (2.0, True)):
-        stored = report.to_dataset().assign_attrs(pareto_k=k).assign_coords(draw=chosen)
+        stored = report.to_dataset().assign_attrs(pareto_k=k).assign_coords(draw=indices)
         posterior = xr.Dataset({"depth": (("chain", "draw"), draws)}, {"chain": [0], "draw": np.arange(6000)})
         axes = plot_accuracy(arviz_data.build({"posterior": posterior, "accuracy": stored})).axes[1]
         (band,) = axes.collections
         x, y = band.get_paths()[0].vertices.T
         assert x.min() >= 0.0
-        top = {at: y[x == at].max() for at in np.unique(x)}
+        top = {edge: y[x == edge].max() for edge in np.unique(x)}
         grid, density = np.array(list(top)), np.array(list(top.values()))
         np.testing.assert_allclose(np.trapezoid(density, grid), 1.0, atol=0.02)
-        near = np.searchsorted(grid, 0.1)
-        np.testing.assert_allclose(density[near], 2 * stats.norm.pdf(0.1), rtol=0.1)
+        index = np.searchsorted(grid, 0.1)
+        np.testing.assert_allclose(density[index], 2 * stats.norm.pdf(0.1), rtol=0.1)
         (corrected,) = [line for line in axes.lines if line.get_linestyle() != "None" and len(line.get_xdata()) > 2]
         assert corrected.is_dashed() is dashed
         assert corrected.get_xdata().min() >= 0.0
@@ -314,7 +314,7 @@ def test_correction_keeps_data_truth_and_the_layout_of_trajectories(checked):
     result, report = checked
     assert report.reliable
     corrected = correct_posterior(result, well, trajectory_draws=6)
-    old, new = (ResultView.of(one).group("trajectories") for one in (result, corrected))
+    old, new = (ResultView.of(source).group("trajectories") for source in (result, corrected))
     assert new["states"].dims == old["states"].dims and new["states"].shape == (1, 6, *old["states"].shape[2:])
     np.testing.assert_array_equal(new["time"], old["time"])
     chains, draws = (ResultView.of(corrected).posterior.sizes[name] for name in ("chain", "draw"))
@@ -343,8 +343,11 @@ def test_a_panel_is_the_sum_of_its_series():
 
     draws = xr.Dataset({"rate": (("chain", "draw"), np.linspace(0.5, 1.5, 8).reshape(2, 4))})
     result = arviz_data.build({"posterior": draws})
-    run = lambda model, y, **keywords: check_accuracy(  # noqa: E731
-        result, model, TIMES, y, draws=8, progress=False, **keywords)
+
+    def run(model, y, **keywords):
+        return check_accuracy(
+            result, model, TIMES, y, draws=8, progress=False, **keywords)
+
     alone, together = run(single, Y), run(panel, np.stack([Y, Y]))
     np.testing.assert_allclose(together.log_ratio, 2 * alone.log_ratio, atol=4 * log_likelihoods.GRID_ERROR)
     particles = run(panel, np.stack([Y, Y]), reference="particles", particles=1000)
@@ -356,7 +359,10 @@ def test_enough_particles_are_found(bent):
     """The pilot raises the number until the noise is below its target."""
     problem = rebuilding.problem(bent, well).select(np.arange(0, 400, 25))
     settings = log_likelihoods.ReferenceSettings("particles", None, 2)
-    noise = lambda e: accuracy_check.noise(importance_weights.average(e))  # noqa: E731
+
+    def noise(e):
+        return accuracy_check.noise(importance_weights.average(e))
+
     result = log_likelihoods.by_particles(problem, settings, noise, 0.02, 1e12)
     assert result.particles > 1000 and not result.limited
     assert noise(result.estimates) < 0.03

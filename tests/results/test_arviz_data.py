@@ -44,12 +44,12 @@ def test_build_and_groups(result, datasets):
 
 def test_add_group_adds_and_replaces(result):
     first, second = xr.Dataset({"y": ("time", [1.0, 2.0])}), xr.Dataset({"y": ("time", [3.0])})
-    before = tuple(ResultView.of(result).groups)
+    initial_groups = tuple(ResultView.of(result).groups)
     assert arviz_data.add_group(result, "forecast", first) is result
     arviz_data.add_group(result, "forecast", second)
-    assert tuple(ResultView.of(result).groups) == (*before, "forecast")
+    assert tuple(ResultView.of(result).groups) == (*initial_groups, "forecast")
     xr.testing.assert_identical(ResultView.of(result).group("forecast"), second)
-    assert tuple(ResultView.of(arviz_data.remove_group(result, "forecast")).groups) == before
+    assert tuple(ResultView.of(arviz_data.remove_group(result, "forecast")).groups) == initial_groups
 
 
 # Files
@@ -57,14 +57,14 @@ def test_add_group_adds_and_replaces(result):
 
 def test_round_trip_keeps_everything(tmp_path, result, datasets):
     path = lfm.save(result, tmp_path / "new" / "posterior.nc")
-    for place in (path, str(path.parent)):
-        loaded = lfm.load(place)
+    for location in (path, str(path.parent)):
+        loaded = lfm.load(location)
         assert type(loaded) is type(result)
         assert set(ResultView.of(loaded).groups) == set(datasets)
         for name, dataset in datasets.items():
-            again = ResultView.of(loaded).group(name)
-            xr.testing.assert_identical(again, dataset)
-            assert all(again[variable].dtype == dataset[variable].dtype for variable in dataset.variables)
+            stored = ResultView.of(loaded).group(name)
+            xr.testing.assert_identical(stored, dataset)
+            assert all(stored[variable].dtype == dataset[variable].dtype for variable in dataset.variables)
         assert ResultView.of(loaded).attrs == ResultView.of(result).attrs
     assert os.listdir(path.parent) == ["posterior.nc"]
     by_arviz = az.from_netcdf(path)
@@ -114,9 +114,9 @@ def test_files_that_are_no_results(tmp_path, result):
         arviz_data.load(tmp_path / "none.nc")
     with pytest.raises(FileNotFoundError, match=r"posterior\.nc"):
         arviz_data.load(tmp_path)
-    whole = arviz_data.save(result, tmp_path / "whole.nc")
+    complete_file = arviz_data.save(result, tmp_path / "whole.nc")
     (tmp_path / "text.nc").write_text("time,y\n0,1\n")
-    (tmp_path / "cut.nc").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    (tmp_path / "cut.nc").write_bytes(complete_file.read_bytes()[: complete_file.stat().st_size // 2])
     with h5netcdf.File(tmp_path / "other.nc", "w") as file:
         file.create_group("posterior")
     arviz_data.save(arviz_data.build({"observed_data": xr.Dataset({"y": ("time", [1.0])})}), tmp_path / "data.nc")

@@ -30,7 +30,7 @@ def panel(times, y=None):
         numpyro.sample("y", lfm.panel(build, rate, times), obs=y)
 
 
-def both(times, y):
+def single_and_panel(times, y):
     shared = numpyro.sample("shared", dist.LogNormal(0.0, 0.5))
     numpyro.sample("one", lfm.MarginalLikelihood(build(shared, (1.0, 2.0)), times["one"]), obs=y["one"])
     with numpyro.plate("subject", len(times["many"])):
@@ -48,7 +48,7 @@ def counts(times, y=None):
 
 
 def converted(model, times, y, draws):
-    """Return the result of random draws in place of those of a posterior."""
+    """Return the result of random draws in place of posterior draws."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lfm.ConvergenceWarning)
         return lfm.to_arviz(draws, model, times, y, trajectory_draws=0)
@@ -78,7 +78,7 @@ def test_a_panel_with_padded_rows_and_a_series_without_data():
 def test_two_sites_of_several_outputs_and_series():
     times, y = {"one": TIMES[0], "many": TIMES[1:]}, {"one": Y[0] * np.array([1.0, 2.0]), "many": Y[1:].copy()}
     y["one"][[1, 3], [0, 1]], y["many"][1, 3:] = np.nan, np.nan
-    result = converted(both, times, y, {"shared": draws_of(), "rate": draws_of(2)})
+    result = converted(single_and_panel, times, y, {"shared": draws_of(), "rate": draws_of(2)})
     pointwise = check_arviz(result, {"one": 10, "many": 9})
     for site, terms in pointwise.items():
         view = lfm.select_series(result, site)

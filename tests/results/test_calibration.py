@@ -54,10 +54,10 @@ class Exact:
         return self.sample(State({"level": jnp.zeros(2)}, key), arguments, keywords)
 
     def sample(self, state, arguments, keywords):
-        key, now = jax.random.split(state.key)
+        key, draw_key = jax.random.split(state.key)
         y = arguments[1]
         precision = 1.0 + y.shape[0]
-        noise = self.widen * jax.random.normal(now, (2,)) / jnp.sqrt(precision)
+        noise = self.widen * jax.random.normal(draw_key, (2,)) / jnp.sqrt(precision)
         return State({"level": y.sum(0) / precision + noise}, key)
 
     def postprocess_fn(self, arguments, keywords):
@@ -71,7 +71,7 @@ def run(widen, **options):
 
 @pytest.fixture(scope="module")
 def conjugate():
-    """Ranks of a level with a known posterior, from a sampler that is exact, and from one that is told lies."""
+    """Ranks of a level with a known posterior, from a sampler that is exact, and from one whose draws are too wide."""
     return run(1.0), run(1.6)
 
 
@@ -120,15 +120,15 @@ def test_tasks_in_a_folder_find_the_same_ranks_and_go_on(conjugate, tmp_path):
 
 
 def test_ranks_survive_a_file_and_are_not_overwritten(tmp_path):
-    made = calibration.Calibration({"decay[0]": np.array([0, 7, 3]), "log likelihood": np.array([1, 2, 3])}, 7)
-    path = calibration.save(made, tmp_path / "deep" / "ranks.npz")
+    original = calibration.Calibration({"decay[0]": np.array([0, 7, 3]), "log likelihood": np.array([1, 2, 3])}, 7)
+    path = calibration.save(original, tmp_path / "deep" / "ranks.npz")
     result = calibration.load(path)
-    assert result.draws == 7 and set(result.ranks) == set(made.ranks)
-    for name in made.ranks:
-        np.testing.assert_array_equal(result.ranks[name], made.ranks[name])
+    assert result.draws == 7 and set(result.ranks) == set(original.ranks)
+    for name in original.ranks:
+        np.testing.assert_array_equal(result.ranks[name], original.ranks[name])
     with pytest.raises(FileExistsError):
-        calibration.save(made, path)
-    assert calibration.save(made, path, overwrite=True) == path
+        calibration.save(original, path)
+    assert calibration.save(original, path, overwrite=True) == path
 
 
 def test_figure_counts_the_ranks(conjugate):

@@ -34,18 +34,18 @@ def wells():
 def exact(wells):
     """Seed -> means and standard deviations by quadrature, the likelihood from the Fokker-Planck equation."""
     model, data = wells
-    times, y = data[WIDER].times, jnp.stack([jnp.asarray(one.y) for one in data.values()])
+    times, y = data[WIDER].times, jnp.stack([jnp.asarray(data_set.y) for data_set in data.values()])
     axes = (np.linspace(np.log(0.85), np.log(6.5), 22), np.linspace(-0.9, 0.25, 22),
             np.linspace(np.log(0.0015), np.log(0.1), 26))
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
-    def one(node):
+    def log_densities(node):
         values = {"sigma": jnp.exp(node[0]), "linear": node[1], "cubic": jnp.exp(node[2])}
         site = likelihood_site(model, (times,), {}, jax.random.key(0), values)
         ssm = state_space(site.distribution.model)
         return log_likelihood(ssm, build_time_grid(ssm, times, 1), y, Grid(-9.0, 9.0, 220))
 
-    result = np.asarray(jax.jit(lambda n: jax.lax.map(one, n))(jnp.asarray(nodes)))
+    result = np.asarray(jax.jit(lambda n: jax.lax.map(log_densities, n))(jnp.asarray(nodes)))
     # The model's priors, in the coordinates of the nodes: normal for all three.
     prior = -0.5 * (((nodes - [0.5, 0.0, -3.0]) / [0.5, 0.5, 1.0]) ** 2).sum(axis=1)
     values = {"sigma": np.exp(nodes[:, 0]), "linear": nodes[:, 1], "cubic": np.exp(nodes[:, 2])}
@@ -83,7 +83,7 @@ def test_importance_weights_correct_the_filter(wells, exact):
 
 
 def test_weights_that_cannot_correct_it_say_so(wells, exact):
-    """Where the filter's posterior lies elsewhere its draws miss the exact one: k is too large, and nothing is said."""
+    """Where the filter's posterior is far off, its draws miss the exact one: k is too large, and nothing is said."""
     model, data = wells
     filtered = lfm.fit(model, data[ELSEWHERE].times, data[ELSEWHERE].y, sampler="ram", chains=4, samples=500,
                        trajectory_draws=0, progress=False)

@@ -49,19 +49,19 @@ def result():
 
 
 @pytest.fixture(scope="module")
-def ahead(result):
+def forecast(result):
     return lfm.forecast(result, counts, AHEAD, draws=100)
 
 
 @pytest.mark.slow
-def test_new_counts_are_counts_and_so_are_their_intervals(result, ahead):
-    predicted = ResultView.of(ahead).group("predictions")
+def test_new_counts_are_counts_and_so_are_their_intervals(result, forecast):
+    predicted = ResultView.of(forecast).group("predictions")
     replicated = ResultView.of(result).group("posterior_predictive")["y"].values
-    for drawn in (predicted["y"].values, replicated):
-        assert np.all(drawn == np.round(drawn)) and np.all(drawn >= 0)
+    for new_counts in (predicted["y"].values, replicated):
+        assert np.all(new_counts == np.round(new_counts)) and np.all(new_counts >= 0)
     table = summary(predicted)
-    ends = table[["q2.5", "q97.5"]].to_numpy()
-    assert np.all(ends == np.round(ends)) and np.all(ends[:, 0] < ends[:, 1])
+    bounds = table[["q2.5", "q97.5"]].to_numpy()
+    assert np.all(bounds == np.round(bounds)) and np.all(bounds[:, 0] < bounds[:, 1])
 
 
 @pytest.mark.thorough
@@ -78,21 +78,21 @@ def test_counts_have_residuals(result):
 
 
 @pytest.mark.thorough
-def test_log_score_is_that_of_the_family_along_the_paths(ahead):
+def test_log_score_is_that_of_the_family_along_the_paths(forecast):
     """Against SciPy: the mean over the draws of the Poisson probability at each path's own rate."""
-    predicted, posterior = (ResultView.of(ahead).group(name) for name in ("predictions", "posterior"))
+    predicted, posterior = (ResultView.of(forecast).group(name) for name in ("predictions", "posterior"))
     level = posterior["level"].values[:, predicted["draw"].values]
     rate = 1.5 * np.exp(level[..., None] + predicted["forces"].values[..., 0]).reshape(-1, 2)
     log_p = special.logsumexp(stats.poisson.logpmf(HELD_OUT[:, 0], rate), axis=0) - np.log(len(rate))
-    result = lfm.score(ahead, HELD_OUT, numpyro_model=counts).loc["events"]
+    result = lfm.score(forecast, HELD_OUT, numpyro_model=counts).loc["events"]
     assert result["log_score"] == pytest.approx(log_p.mean(), abs=1e-12)
-    drawn = predicted["y"].values.reshape(len(rate), 2)
-    far = np.abs(drawn - HELD_OUT[:, 0]).mean(0) - 0.5 * np.abs(drawn[:, None] - drawn).sum((0, 1)) / (
+    new_counts = predicted["y"].values.reshape(len(rate), 2)
+    far = np.abs(new_counts - HELD_OUT[:, 0]).mean(0) - 0.5 * np.abs(new_counts[:, None] - new_counts).sum((0, 1)) / (
         len(rate) * (len(rate) - 1))
     assert result["crps"] == pytest.approx(far.mean(), rel=1e-12)
-    assert np.isnan(lfm.score(ahead, HELD_OUT).loc["events", "log_score"])
+    assert np.isnan(lfm.score(forecast, HELD_OUT).loc["events", "log_score"])
     with pytest.raises(ValueError, match="dataset"):
-        lfm.score(ResultView.of(ahead).group("predictions"), HELD_OUT, numpyro_model=counts)
+        lfm.score(ResultView.of(forecast).group("predictions"), HELD_OUT, numpyro_model=counts)
 
 
 def test_densities_are_those_of_the_times_that_are_asked_for():
@@ -124,8 +124,8 @@ def test_check_by_importance_sampling_and_correction(result):
     assert np.abs(ratio).max() < 0.15 + 5 * report.dataset["noise_sd"].values.max()
     assert report.k < report.threshold
     corrected = lfm.correct_posterior(result, counts, trajectory_draws=10)
-    drawn = ResultView.of(corrected).group("posterior_predictive")["y"].values
-    assert np.all(drawn == np.round(drawn))
+    new_counts = ResultView.of(corrected).group("posterior_predictive")["y"].values
+    assert np.all(new_counts == np.round(new_counts))
     with pytest.raises(ValueError, match="log likelihoods"):
         lfm.check_accuracy(result, lambda times, y=None: counts(times, y, FactorSettings()), TIMES, COUNTS + 1.0,
                            draws=4, particles=10, replicates=2, progress=False)
@@ -173,8 +173,8 @@ def test_particles_check_and_correct_counts_of_dynamics_that_are_not_linear():
                                trajectory_draws=20, progress=False) for sampler in ("nuts", "pmmh"))
     report = lfm.check_accuracy(filtered, driven, draws=40, particles=2000, replicates=3, progress=False)
     assert "particle filter" in report.reference and report.k < report.threshold
-    means = [float(ResultView.of(one).posterior["level"].mean()) for one in (filtered, exact)]
+    means = [float(ResultView.of(source).posterior["level"].mean()) for source in (filtered, exact)]
     sd = float(ResultView.of(exact).posterior["level"].std())
     assert abs(means[0] - means[1]) < 0.4 * sd
-    drawn = ResultView.of(lfm.forecast(exact, driven, AHEAD, draws=20)).group("predictions")["y"].values
-    assert np.all(drawn == np.round(drawn))
+    new_counts = ResultView.of(lfm.forecast(exact, driven, AHEAD, draws=20)).group("predictions")["y"].values
+    assert np.all(new_counts == np.round(new_counts))

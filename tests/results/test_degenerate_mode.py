@@ -64,8 +64,8 @@ def test_a_group_that_collapses_is_named_everywhere(y, keywords, tmp_path):
     assert table["warnings"].to_dict() == {name: "degenerate mode" * (name == "spread") for name in table.index}
     written = tables.annotate(table, result)["warnings"]
     assert written["spread"] == message and written["mean"] == ""
-    again = lfm.load(lfm.save(result, tmp_path / "posterior.nc"))
-    page = lfm.save_report(again, tmp_path, figures=()).read_text()
+    loaded = lfm.load(lfm.save(result, tmp_path / "posterior.nc"))
+    page = lfm.save_report(loaded, tmp_path, figures=()).read_text()
     assert page.index("degenerate in spread") < page.index('id="model"')
 
 

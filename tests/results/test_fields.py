@@ -36,18 +36,18 @@ def result():
 
 
 def test_moments_are_those_of_the_draws_with_their_parameters(result):
-    places = np.array([0.3, 1.1])
-    evaluated = lfm.evaluate_field(result, source, places)
+    positions = np.array([0.3, 1.1])
+    evaluated = lfm.evaluate_field(result, source, positions)
     draws = []
     for chain in range(2):
         for draw in range(20):
             scale = result["posterior"]["scale"].values[chain, 2 * draw]
             draws.append(result["trajectories"]["forces"].values[chain, draw]
-                         @ np.asarray(source({"scale": scale}).weights(places)[0]).T)
+                         @ np.asarray(source({"scale": scale}).weights(positions)[0]).T)
     np.testing.assert_allclose(evaluated["draws"].values.reshape(40, 9, 2), draws, atol=1e-12)
     np.testing.assert_allclose(evaluated["mean"], np.mean(draws, axis=0), atol=1e-12)
     np.testing.assert_allclose(evaluated["sd"], np.std(draws, axis=0), atol=1e-12)
-    true = result["truth"]["forces"].values @ np.asarray(source({"scale": 0.7}).weights(places)[0]).T
+    true = result["truth"]["forces"].values @ np.asarray(source({"scale": 0.7}).weights(positions)[0]).T
     np.testing.assert_allclose(evaluated["truth"].values[::2], true, atol=1e-12)
 
 
@@ -59,8 +59,8 @@ def test_fixed_parameters_are_those_of_the_fit(result):
 
 
 def test_the_sd_contains_the_variance_beyond_the_forces(result):
-    place = np.array([[5.0, 5.0]])  # far from the points
-    evaluated = lfm.evaluate_field(result, separable, place)
+    position = np.array([[5.0, 5.0]])  # far from the points
+    evaluated = lfm.evaluate_field(result, separable, position)
     scale = result["posterior"]["scale"].values[:, ::2]
     np.testing.assert_allclose(evaluated["sd"], np.sqrt((scale**2).mean()), rtol=0.02)
 

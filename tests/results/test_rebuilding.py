@@ -1,4 +1,4 @@
-"""Later known inputs and doses continue those of a fit."""
+"""Later known inputs and doses continue the inputs and doses of a fit."""
 
 import numpy as np
 import pytest

@@ -65,9 +65,9 @@ def test_a_misfit_is_said_and_a_fit_is_not():
     wide = result_with(3.0 * np.random.default_rng(7).normal(size=(60, 1)))
     assert misfit(wide)
     for name, value in (("constraints", "x >= 0"), ("sampler", "pmmh")):
-        other = result_with(3.0 * np.random.default_rng(7).normal(size=(60, 1)))
-        other.attrs[name] = value
-        assert misfit(other) == []
+        other_result = result_with(3.0 * np.random.default_rng(7).normal(size=(60, 1)))
+        other_result.attrs[name] = value
+        assert misfit(other_result) == []
     few = result_with(np.full((3, 1), 9.0))
     assert misfit(few) == []
 
@@ -126,6 +126,6 @@ def test_normal_scores_cover_ordered_normal_values():
     median, low, high = normal_scores(15)
     # Three standard errors of a median and of a 95% coverage from 4,000 draws.
     assert np.all(np.abs((ordered < median).mean(axis=0) - 0.5) < 3 * 0.5 / np.sqrt(4000))
-    inside = ((ordered > low) & (ordered < high)).mean(axis=0)
-    assert np.all(np.abs(inside - 0.95) < 3.5 * np.sqrt(0.95 * 0.05 / 4000))
+    coverage = ((ordered > low) & (ordered < high)).mean(axis=0)
+    assert np.all(np.abs(coverage - 0.95) < 3.5 * np.sqrt(0.95 * 0.05 / 4000))
     np.testing.assert_allclose(median, -median[::-1], atol=1e-12)

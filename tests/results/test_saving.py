@@ -25,12 +25,12 @@ def test_every_figure_in_every_format(tmp_path, result):
 
 
 def test_figures_without_their_group_are_left_out(tmp_path, datasets):
-    kept = {name: datasets[name] for name in ("posterior", "data")}
-    paths = save_figures(arviz_data.build(kept), tmp_path, "png")
+    groups = {name: datasets[name] for name in ("posterior", "data")}
+    paths = save_figures(arviz_data.build(groups), tmp_path, "png")
     assert [path.name for path in paths] == ["trace.png", "pairs.png"]
-    kept["trajectories"] = datasets["trajectories"].drop_dims(["force", "output"])
-    kept["posterior"] = kept["posterior"][["anchor"]]
-    paths = save_figures(arviz_data.build(kept), tmp_path, "png")
+    groups["trajectories"] = datasets["trajectories"].drop_dims(["force", "output"])
+    groups["posterior"] = groups["posterior"][["anchor"]]
+    paths = save_figures(arviz_data.build(groups), tmp_path, "png")
     assert [path.name for path in paths] == ["states.png"]
     assert matplotlib.image.imread(paths[0]).shape[1] == 7.0 * 300
     only = arviz_data.build({"data": xr.Dataset({"y": ("time", [1.0])})})

@@ -37,8 +37,9 @@ def test_crps_is_the_integral_of_the_squared_distance_of_distributions():
 
 def test_crps_of_draws_is_unbiased_for_that_of_the_normal_distribution():
     y = np.array([-1.0, 0.2, 3.0])
-    exact = [integrate.quad(lambda v, at=at: (stats.norm.cdf(v) - (v >= at)) ** 2, -12, 12, points=[at], limit=200)[0]
-             for at in y]
+    exact = [integrate.quad(lambda v, datum=datum: (stats.norm.cdf(v) - (v >= datum)) ** 2, -12, 12, points=[datum],
+                            limit=200)[0]
+             for datum in y]
     closed = scoring.gaussian_scores(np.zeros(3), np.ones(3), y)
     np.testing.assert_allclose(closed.crps, exact, rtol=1e-6)
     np.testing.assert_allclose(closed.log_score, stats.norm.logpdf(y))
@@ -66,11 +67,11 @@ def test_scores_of_a_mixture():
     ranked = scoring.crps(dataset["y"].values[0], y)
     np.testing.assert_allclose(result.loc["a", "crps"], np.nanmean(ranked[:, 0]))
     low, high = mixture_quantiles(mean, sd, [0.25, 0.75])
-    for ends, p in ((low, 0.25), (high, 0.75)):
-        np.testing.assert_allclose(stats.norm.cdf(ends, mean, sd).mean(axis=0), p, atol=1e-8)
-    inside = np.where(np.isnan(y), np.nan, (low <= y) & (y <= high))
+    for quantile, p in ((low, 0.25), (high, 0.75)):
+        np.testing.assert_allclose(stats.norm.cdf(quantile, mean, sd).mean(axis=0), p, atol=1e-8)
+    is_covered = np.where(np.isnan(y), np.nan, (low <= y) & (y <= high))
     np.testing.assert_allclose(lfm.score(dataset, y, level=0.5)["coverage_50"],
-                               [np.nanmean(inside[:, 0]), inside[:, 1].mean(), np.nanmean(inside)])
+                               [np.nanmean(is_covered[:, 0]), is_covered[:, 1].mean(), np.nanmean(is_covered)])
 
 
 def test_quantiles_of_a_mixture_with_one_part_far_away():

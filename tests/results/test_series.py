@@ -37,9 +37,9 @@ def test_rows_scores_and_units(panel):
     assert data["y"].dims == ("time", "output") and data["time"].attrs == {"units": "h"}
     np.testing.assert_array_equal(data["time"], [0.0, 1.0])
     np.testing.assert_array_equal(ResultView.of(view).group("log_likelihood")["y"][0, 0], [0.0, 1.0])
-    other = ResultView.of(lfm.select_series(panel, "9"))
-    np.testing.assert_array_equal(other.group("data")["time"], [0.0, 2.0, 4.0])  # missing, and no padding
-    np.testing.assert_array_equal(other.group("log_likelihood")["y"][0, 0], [2.0, 3.0])
+    other_view = ResultView.of(lfm.select_series(panel, "9"))
+    np.testing.assert_array_equal(other_view.group("data")["time"], [0.0, 2.0, 4.0])  # missing, and no padding
+    np.testing.assert_array_equal(other_view.group("log_likelihood")["y"][0, 0], [2.0, 3.0])
     assert "accuracy" not in ResultView.of(view).groups
 
 

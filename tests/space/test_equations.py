@@ -20,10 +20,10 @@ SPATIAL = {1: (lfm.Matern(1.3, 0.4, order=1), references.matern(1, 1.3, 0.4)),
            2: (lfm.SquaredExponential(1.3, 0.6), references.squared_exponential(1.3, 0.6))}
 
 
-def functions(boundary, domain, modes, places):
+def functions(boundary, domain, modes, positions):
     """Eigenfunctions and wavenumbers of one dimension, by their definition."""
     (low, high), n = domain, np.arange(modes)
-    x, length = places[:, None] - low, high - low
+    x, length = positions[:, None] - low, high - low
     if boundary == "dirichlet":
         return np.sqrt(2 / length) * np.sin((n + 1) * np.pi * x / length), (n + 1) * np.pi / length
     if boundary == "neumann":
@@ -32,12 +32,12 @@ def functions(boundary, domain, modes, places):
     return np.sqrt((2 - (n == 0)) / length) * np.where(n % 2 == 1, np.cos(w * x), np.where(n, np.sin(w * x), 1.0)), w
 
 
-def expansion(boundary, dimension, modes, places):
+def expansion(boundary, dimension, modes, positions):
     """Eigenfunctions and wavenumbers of an interval or a rectangle, in any order."""
     if dimension == 1:
-        return functions(boundary, (0.0, 1.0), modes, places)
-    (phi, v), (psi, w) = (functions(boundary, RECTANGLE[axis], modes, places[:, axis]) for axis in (0, 1))
-    return (phi[:, :, None] * psi[:, None, :]).reshape(len(places), -1), np.hypot(v[:, None], w).ravel()
+        return functions(boundary, (0.0, 1.0), modes, positions)
+    (phi, v), (psi, w) = (functions(boundary, RECTANGLE[axis], modes, positions[:, axis]) for axis in (0, 1))
+    return (phi[:, :, None] * psi[:, None, :]).reshape(len(positions), -1), np.hypot(v[:, None], w).ravel()
 
 
 def equation(kind, boundary, dimension, modes=3, sensors=None, **options):
@@ -80,12 +80,12 @@ def test_equals_dense_algebra(kind, boundary, dimension):
     covariances = coefficient_covariances(kind, boundary, dimension)
 
     def covariance(first, second):
-        phi, psi = (expansion(boundary, dimension, 3, places)[0] for places in (first, second))
+        phi, psi = (expansion(boundary, dimension, 3, positions)[0] for positions in (first, second))
         return np.einsum("aj,bj,jts->tasb", phi, psi, covariances).reshape(5 * len(first), 5 * len(second))
 
-    places, new = PLACES[dimension], NEW_PLACES[dimension]
-    dense = covariance(places, places)[np.ix_(seen, seen)] + 0.02 * np.eye(seen.sum())
-    mean, reduction, log_density = references.condition(covariance(new, places)[:, seen], dense, y.ravel()[seen])
+    positions, new = PLACES[dimension], NEW_PLACES[dimension]
+    dense = covariance(positions, positions)[np.ix_(seen, seen)] + 0.02 * np.eye(seen.sum())
+    mean, reduction, log_density = references.condition(covariance(new, positions)[:, seen], dense, y.ravel()[seen])
     assert float(lfm.MarginalLikelihood(model, TIMES).log_prob(y)) == pytest.approx(log_density, abs=1e-8)
     smoothed, modes = lfm.smooth(model, TIMES, y), len(basis.wavenumbers)
     weights = basis.functions(new)
@@ -94,17 +94,17 @@ def test_equals_dense_algebra(kind, boundary, dimension):
     np.testing.assert_allclose(variance.ravel(), np.diagonal(covariance(new, new) - reduction), atol=1e-8)
 
 
-def field(basis, model, times, places):
+def field(basis, model, times, positions):
     """The field (T, P) of a model without a source, from its filter; the state is known and ignores the data."""
     result = lfm.filter(model, times, np.zeros((len(times), len(model.output_names))))
-    return np.asarray(result.predicted_mean[:, :len(basis.wavenumbers)] @ basis.functions(places).T)
+    return np.asarray(result.predicted_mean[:, :len(basis.wavenumbers)] @ basis.functions(positions).T)
 
 
 @pytest.mark.parametrize(("boundary", "sign"), [("dirichlet", -1.0), ("neumann", 1.0), ("periodic", 0.0)])
 def test_an_initial_field_spreads_by_the_heat_kernel(boundary, sign):
     """A Gaussian bump stays one, of a growing variance; its images keep the boundary condition."""
     basis = lfm.LaplaceBasis((0.0, 2.0), 81, boundary)
-    places, times = np.linspace(0.0, 2.0, 9), np.array([0.0, 0.5, 3.0])
+    positions, times = np.linspace(0.0, 2.0, 9), np.array([0.0, 0.5, 3.0])
 
     def bump(r, t=0.0):
         variance = 0.07**2 + 2.0 * 0.02 * t
@@ -114,38 +114,38 @@ def test_an_initial_field_spreads_by_the_heat_kernel(boundary, sign):
             a * np.exp(-0.5 * (r - centre)**2 / variance) for a, centre in images)
 
     start = lfm.Gaussian(basis.coefficients(bump), np.zeros(81))
-    model = lfm.heat(basis, 0.02, 0.3, sensors=places, covariance=1.0, initial=start)
-    expected = np.array([bump(places, t) for t in times])
-    np.testing.assert_allclose(field(basis, model, times, places), expected, atol=1e-8)
+    model = lfm.heat(basis, 0.02, 0.3, sensors=positions, covariance=1.0, initial=start)
+    expected = np.array([bump(positions, t) for t in times])
+    np.testing.assert_allclose(field(basis, model, times, positions), expected, atol=1e-8)
 
 
 def test_a_plucked_string_moves_as_dalembert_says():
     basis = lfm.LaplaceBasis((0.0, 1.0), 90)
-    places, times, speed = np.linspace(0.0, 1.0, 11), np.array([0.0, 0.21, 0.77, 3.4]), 1.3
+    positions, times, speed = np.linspace(0.0, 1.0, 11), np.array([0.0, 0.21, 0.77, 3.4]), 1.3
 
     def odd(r):
         r = np.mod(r + 1.0, 2.0) - 1.0
         return np.sign(r) * np.exp(-0.5 * ((np.abs(r) - 0.4) / 0.05)**2)
 
     start = lfm.Gaussian(jnp.concatenate([basis.coefficients(odd), jnp.zeros(90)]), np.zeros(180))
-    model = lfm.wave(basis, speed, 0.0, sensors=places, covariance=1.0, initial=start)
-    expected = [0.5 * (odd(places - speed * t) + odd(places + speed * t)) for t in times]
-    np.testing.assert_allclose(field(basis, model, times, places), expected, atol=1e-8)
+    model = lfm.wave(basis, speed, 0.0, sensors=positions, covariance=1.0, initial=start)
+    expected = [0.5 * (odd(positions - speed * t) + odd(positions + speed * t)) for t in times]
+    np.testing.assert_allclose(field(basis, model, times, positions), expected, atol=1e-8)
 
 
 def test_a_mode_of_a_damped_rectangle_is_a_cosine():
     basis = lfm.LaplaceBasis(((0.0, 2.0), (0.0, 1.0)), (2, 3), "neumann")
-    places, times = np.array([[0.3, 0.2], [1.7, 0.9]]), np.linspace(0.0, 5.0, 6)
+    positions, times = np.array([[0.3, 0.2], [1.7, 0.9]]), np.linspace(0.0, 5.0, 6)
     frequency = 0.8 * np.hypot(np.pi / 2, 2 * np.pi)
 
     def shape(r):
         return np.cos(np.pi * r[:, 0] / 2) * np.cos(2 * np.pi * r[:, 1])
 
     start = lfm.Gaussian(jnp.concatenate([basis.coefficients(shape), jnp.zeros(6)]), np.zeros(12))
-    model = lfm.wave(basis, 0.8, 0.4, sensors=places, covariance=1.0, initial=start)
+    model = lfm.wave(basis, 0.8, 0.4, sensors=positions, covariance=1.0, initial=start)
     damped = np.sqrt(frequency**2 - 0.04)
     amplitude = np.exp(-0.2 * times) * (np.cos(damped * times) + 0.2 / damped * np.sin(damped * times))
-    np.testing.assert_allclose(field(basis, model, times, places), amplitude[:, None] * shape(places), atol=1e-8)
+    np.testing.assert_allclose(field(basis, model, times, positions), amplitude[:, None] * shape(positions), atol=1e-8)
 
 
 @pytest.mark.filterwarnings("ignore::lfm_ppl.ApproximationWarning")
@@ -159,28 +159,28 @@ def test_the_modes_converge_at_the_rate_of_the_spectral_density(order, rate):
 
 def test_away_from_the_edges_the_source_has_the_covariance_of_its_kernel():
     basis = lfm.LaplaceBasis((-2.0, 3.0), 200)
-    places = np.linspace(0.0, 1.0, 5)
+    positions = np.linspace(0.0, 1.0, 5)
     for kernel in (lfm.SquaredExponential(1.4, 0.2), lfm.Matern(1.4, 0.2, order=3)):
-        weights, _ = lfm.SpectralField(basis, kernel, lfm.Matern(1.0, 1.0)).weights(places)
-        np.testing.assert_allclose(weights @ weights.T, kernel.covariance(places[:, None], places), atol=1e-5)
+        weights, _ = lfm.SpectralField(basis, kernel, lfm.Matern(1.0, 1.0)).weights(positions)
+        np.testing.assert_allclose(weights @ weights.T, kernel.covariance(positions[:, None], positions), atol=1e-5)
 
 
 @pytest.mark.thorough
 def test_sensors_may_move():
-    basis, _, still = equation("heat", "dirichlet", 1, sensors=np.linspace(0.1, 0.9, 5))
-    moving = equation("heat", "dirichlet", 1, sensors=lambda t: jnp.array([0.1 + 0.4 * t]))[2]
+    basis, _, fixed_model = equation("heat", "dirichlet", 1, sensors=np.linspace(0.1, 0.9, 5))
+    moving_model = equation("heat", "dirichlet", 1, sensors=lambda t: jnp.array([0.1 + 0.4 * t]))[2]
     y = np.random.default_rng(1).normal(size=(len(TIMES), 1))
     path = 0.1 + 0.4 * TIMES
     rows = np.full((len(TIMES), len(TIMES)), np.nan)
     np.fill_diagonal(rows, y)
     each_place = equation("heat", "dirichlet", 1, sensors=path)[2]
     expected = lfm.MarginalLikelihood(each_place, TIMES).log_prob(rows)
-    assert float(lfm.MarginalLikelihood(moving, TIMES).log_prob(y)) == pytest.approx(float(expected), abs=1e-9)
-    assert simulate(jax.random.key(0), moving, TIMES).y.shape == (5, 1)
-    assert still.output_names[-1] == "sensor 4"
-    outside = equation("heat", "dirichlet", 1, sensors=lambda t: [0.1 + 10.0 * t])[2]
+    assert float(lfm.MarginalLikelihood(moving_model, TIMES).log_prob(y)) == pytest.approx(float(expected), abs=1e-9)
+    assert simulate(jax.random.key(0), moving_model, TIMES).y.shape == (5, 1)
+    assert fixed_model.output_names[-1] == "sensor 4"
+    outside_model = equation("heat", "dirichlet", 1, sensors=lambda t: [0.1 + 10.0 * t])[2]
     with pytest.warns(lfm.FilterWarning):
-        assert lfm.MarginalLikelihood(outside, TIMES).log_prob(y) == -np.inf
+        assert lfm.MarginalLikelihood(outside_model, TIMES).log_prob(y) == -np.inf
 
 
 @pytest.mark.thorough

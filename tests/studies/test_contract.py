@@ -12,7 +12,7 @@ SMALL = {
     "transcription": {"datasets": 2}, "transcription-parameters": {}, "ballistic": {"runs": 2},
     "periodic-kernels": {}, "call-centre": {"days": 1}, "constrained": {}, "counts": {"problems": ("student-t",)},
 }
-"""Settings of the small run, besides those of the quick version. That on satellites is in test_gps.py."""
+"""Settings of the small run, besides the settings of the quick version. The study on satellites is in test_gps.py."""
 
 
 def test_every_study_is_listed():

@@ -14,19 +14,19 @@ def test_weighted_draws_have_the_moments_of_their_density():
     factor = np.array([[2.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.0, -0.3, 0.4]])
     target = stats.multivariate_normal([1.0, -2.0, 3.0], factor @ factor.T)
     mode = SimpleNamespace(point=target.mean + [1.0, 0.0, 0.2], curvature=SimpleNamespace(factor=0.8 * factor))
-    draws, result, _ = every = weighted(target.logpdf, [mode], 20_000, 0)
-    mean, covariance = moments(draws, every.weight)
+    draws, result, _ = weighted_draws = weighted(target.logpdf, [mode], 20_000, 0)
+    mean, covariance = moments(draws, weighted_draws.weight)
     # Without the second t distribution it is below 12,000.
     assert result.k < 0.5 and result.ess > 15_000
     variance = np.diag(target.cov)
     np.testing.assert_array_less(np.abs(mean - target.mean), 4 * np.sqrt(variance / result.ess))
     np.testing.assert_allclose(np.diag(covariance), variance, rtol=4 * np.sqrt(2 / result.ess))
-    summary, taken = every.summary, every.resampled(5_000, 0)
+    summary, resample = weighted_draws.summary, weighted_draws.resampled(5_000, 0)
     np.testing.assert_allclose(summary["posterior_mean"], mean)
     np.testing.assert_allclose(summary["posterior_sd"], np.sqrt(np.diag(covariance)))
     assert (summary["k"], summary["ess"]) == (result.k, result.ess)
-    assert taken.shape == (5_000, 3)
-    np.testing.assert_array_less(np.abs(taken.mean(axis=0) - target.mean), 4 * np.sqrt(variance / 4_000))
+    assert resample.shape == (5_000, 3)
+    np.testing.assert_array_less(np.abs(resample.mean(axis=0) - target.mean), 4 * np.sqrt(variance / 4_000))
     with pytest.raises(ValueError, match="no curvature"):
         weighted(target.logpdf, [SimpleNamespace(point=mode.point, curvature=None)], 10, 0)
 
@@ -82,8 +82,8 @@ def test_a_mode_that_is_not_given_is_not_seen():
 @pytest.mark.parametrize("where", [[40.0, 0.0], [0.1, 0.05]])
 def test_what_is_no_mode_does_no_harm(where):
     """A second point without mass about it; and the same mode given twice."""
-    other = stats.multivariate_normal(where, FIRST.cov)
-    draws, result, mass = weighted(FIRST.logpdf, modes(FIRST, other), 4_000, 0)
+    second = stats.multivariate_normal(where, FIRST.cov)
+    draws, result, mass = weighted(FIRST.logpdf, modes(FIRST, second), 4_000, 0)
     mean, covariance = moments(draws, np.exp(result.log_weight[0]))
     assert result.reliable and result.ess > 3_000
     np.testing.assert_array_less(np.abs(mean), 4 * np.sqrt(np.diag(FIRST.cov) / result.ess))
@@ -110,19 +110,19 @@ def test_mixture_weights_are_right_from_few_draws(share):
 def test_densities_that_are_not_finite_have_no_weight():
     """Half of the space has none; a density of a single parameter; a mode without curvature beside one that has it."""
     def log_density(z):
-        inside = stats.norm(1.0, 2.0).logpdf(z[:, 0])
-        return np.where(z[:, 0] > 4.0, np.inf, np.where(z[:, 0] < -2.0, np.nan, inside))
+        log_prob = stats.norm(1.0, 2.0).logpdf(z[:, 0])
+        return np.where(z[:, 0] > 4.0, np.inf, np.where(z[:, 0] < -2.0, np.nan, log_prob))
 
-    given = [SimpleNamespace(point=np.array([9.0]), curvature=None),
-             SimpleNamespace(point=np.array([1.0]), curvature=SimpleNamespace(factor=np.array([[2.0]])))]
-    draws, result, mass = weighted(log_density, given, 5_000, 0)
+    candidates = [SimpleNamespace(point=np.array([9.0]), curvature=None),
+                  SimpleNamespace(point=np.array([1.0]), curvature=SimpleNamespace(factor=np.array([[2.0]])))]
+    draws, result, mass = weighted(log_density, candidates, 5_000, 0)
     weight = np.exp(result.log_weight[0])
     assert draws.shape == (5_000, 1) and mass.tolist() == pytest.approx([1.0])
     assert (weight[(draws[:, 0] < -2.0) | (draws[:, 0] > 4.0)] == 0).all()
     expected = stats.truncnorm(-1.5, 1.5, 1.0, 2.0)
     assert weight @ draws[:, 0] == pytest.approx(1.0, abs=4 * expected.std() / np.sqrt(result.ess))
     with pytest.raises(ValueError, match="likelihood of zero"):
-        weighted(lambda z: np.full(len(z), np.nan), given[1:], 10, 0)
+        weighted(lambda z: np.full(len(z), np.nan), candidates[1:], 10, 0)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 50])

@@ -18,9 +18,9 @@ SETS = [(jnp.array([[0.4], [0.8], [jnp.nan], [0.7]]) * factor, {"shift": jnp.asa
 
 def model(data):
     """Data that are a pytree: measurements, and a number that is known of each data set."""
-    y, known = data
+    y, constants = data
     decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
-    amount = numpyro.sample("amount", dist.LogNormal(known["shift"], 0.5))
+    amount = numpyro.sample("amount", dist.LogNormal(constants["shift"], 0.5))
     system = systems.motif(systems.identity, decay, lengthscale=amount, noise_sd=0.3 * jnp.ones(1), genes=1)
     numpyro.sample("y", lfm.MarginalLikelihood(system, TIMES, steps=2, iterations=0), obs=y)
 
@@ -47,7 +47,7 @@ def test_the_densities_are_those_of_the_model_in_the_order_of_the_names(bound):
     np.testing.assert_allclose([part[0] for part in several], expected[1], rtol=1e-10)
     result = posterior.likelihood(z, SETS[1]).model
     np.testing.assert_allclose(result.observation.covariance, system.observation.covariance)
-    # The medians of 15 draws are within 4 standard errors, 1.25 sd / sqrt(15), of those of the prior.
+    # The medians of 15 draws are within 4 standard errors, 1.25 sd / sqrt(15), of the medians of the prior.
     for order in (posterior, turned):
         difference = np.abs(order.central - np.array([{"decay": 0.0, "amount": 1.0}[name] for name in order.names]))
         assert (difference < 4 * 1.25 * 0.5 / np.sqrt(15)).all()
@@ -73,10 +73,10 @@ def test_the_weight_of_the_prior_and_the_data_are_arguments_of_one_program(bound
 def test_the_filter_and_the_likelihood_take_what_the_site_observes(bound):
     """The data are a pair; the site observes its first."""
     z = np.array([0.1, -0.2])
-    other = bound.with_data(SETS[1])
+    other_bound = bound.with_data(SETS[1])
     total = float(bound.log_likelihood(z, SETS[1]))
     assert float(bound.filter(z, SETS[1]).log_likelihood.sum()) == pytest.approx(total, rel=1e-10)
-    assert float(other.log_likelihood(z)) == pytest.approx(total, rel=1e-12)
+    assert float(other_bound.log_likelihood(z)) == pytest.approx(total, rel=1e-12)
     assert bound.smooth(z).mean.shape[0] == len(TIMES)
 
 

@@ -148,7 +148,7 @@ def test_the_likelihood_is_that_of_weighted_paths():
 def test_forces_that_jump_are_followed():
     """A random jump of the force between two decisions: mean and variance of both kinds of particles."""
 
-    class Kicked(lfm.Matern):
+    class JumpingForce(lfm.Matern):
         jump_times = (1.1,)
 
         def jump(self, index):
@@ -156,7 +156,7 @@ def test_forces_that_jump_are_followed():
 
     def kicked(heater):
         model = house(heater)
-        return lfm.LatentForceModel(model.dynamics, {"rest": Kicked(SCALE, LENGTH, order=0)}, model.observation,
+        return lfm.LatentForceModel(model.dynamics, {"rest": JumpingForce(SCALE, LENGTH, order=0)}, model.observation,
                                     model.initial_state)
 
     result = lfm.rao_blackwellised(jax.random.key(9), kicked, THERMOSTAT, TIMES, particles=1000)

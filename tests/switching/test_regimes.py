@@ -91,12 +91,12 @@ def enumerate_paths(switching, y):
         for k, regime in enumerate(path):
             phi, offset, noise = maps[regime][k]
             mean, covariance = phi @ mean + offset, phi @ covariance @ phi.T + noise
-            here = slice(k * size, (k + 1) * size)
+            block = slice(k * size, (k + 1) * size)
             if k:
-                before = cross[(k - 1) * size:k * size, :k * size]
-                cross[here, :k * size] = phi @ before
-                cross[:k * size, here] = cross[here, :k * size].T
-            cross[here, here] = covariance
+                previous = cross[(k - 1) * size:k * size, :k * size]
+                cross[block, :k * size] = phi @ previous
+                cross[:k * size, block] = cross[block, :k * size].T
+            cross[block, block] = covariance
             state_means.append(mean)
         h = scipy.linalg.block_diag(*(outputs[r][0] for r in path))
         mu = h @ np.concatenate(state_means) + np.concatenate([outputs[r][1] for r in path])
@@ -227,8 +227,8 @@ def test_equal_regimes_are_one_model(merging):
     switching = lfm.Switching({"a": build(), "b": build()}, RATES, times, merging=merging)
     np.testing.assert_allclose(switching.log_prob(y), single.log_prob(y), rtol=1e-10)
     np.testing.assert_allclose(switching.log_prob_per_observation(y), single.log_prob_per_observation(y), atol=1e-10)
-    at = np.array([0.2, 1.0, 3.0, 4.5])
-    smoothed, expected = switching.smooth(y, at), single.smooth(y, at)
+    requested_times = np.array([0.2, 1.0, 3.0, 4.5])
+    smoothed, expected = switching.smooth(y, requested_times), single.smooth(y, requested_times)
     np.testing.assert_allclose(smoothed.mean, expected.mean, atol=1e-9)
     np.testing.assert_allclose(smoothed.covariance, expected.covariance, atol=1e-9)
     scores = switching.scores(jax.random.key(0), y)
@@ -240,8 +240,8 @@ def test_equal_regimes_are_one_model(merging):
 def test_requested_times_change_no_probability():
     switching = lfm.Switching({"calm": build(0.3), "rough": build(2.0, 0.3)}, RATES, np.arange(6.0))
     y = np.asarray(switching.sample(jax.random.key(3)))
-    at = np.arange(0.0, 5.01, 0.25)
-    smoothed = switching.smooth(y, at)
+    requested_times = np.arange(0.0, 5.01, 0.25)
+    smoothed = switching.smooth(y, requested_times)
     np.testing.assert_allclose(smoothed.log_likelihood.sum(), switching.log_prob(y), rtol=1e-9)
     # The regime is that of the next observation.
     np.testing.assert_allclose(smoothed.probability[1:3], np.broadcast_to(smoothed.probability[3], (2, 2)), atol=1e-9)

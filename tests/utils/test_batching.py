@@ -64,10 +64,10 @@ def test_calls_run_side_by_side_and_come_in_their_order():
 
 
 def test_after_an_error_nothing_more_begins():
-    begun, passes = [], threading.Event()
+    started, passes = [], threading.Event()
 
     def program(number):
-        begun.append(number)
+        started.append(number)
         if number:
             passes.wait(60)
         return 1 / number
@@ -75,22 +75,23 @@ def test_after_an_error_nothing_more_begins():
     threading.Timer(0.2, passes.set).start()
     with pytest.raises(ZeroDivisionError):
         list(batching.side_by_side(program, [(number,) for number in range(20)], 2))
-    assert len(begun) <= 3
+    assert len(started) <= 3
 
 
 @pytest.mark.thorough
 def test_an_interruption_between_two_batches_ends_the_others(two_cpus):
     bound, count = lfm.bind(relaxation, np.arange(4.0), np.array([[0.3], [0.9], [np.nan], [-0.8]])), 70
-    kept = {}
+    stored_parts = {}
 
     class Kept(dict):
         def put(self, start, part):
-            kept[start] = part
+            stored_parts[start] = part
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         scores(jax.random.key(0), bound, {"noise": np.linspace(0.5, 0.8, count)}, store=Kept())
-    assert list(kept) == [0] and not [one for one in threading.enumerate() if "side by side" in one.name]
+    assert list(stored_parts) == [0]
+    assert not [thread for thread in threading.enumerate() if "side by side" in thread.name]
 
 
 class Recorder:
@@ -121,5 +122,5 @@ def test_draws_are_shared_out_to_the_threads_with_the_same_numbers(two_cpus, mon
     monkeypatch.setattr(compilation, "cpus", lambda: 1)
     for name, run in compute.items():
         alone = run()
-        for one, value in several[name].items():
-            np.testing.assert_array_equal(value, alone[one], err_msg=f"{name}: {one}")
+        for entry, value in several[name].items():
+            np.testing.assert_array_equal(value, alone[entry], err_msg=f"{name}: {entry}")

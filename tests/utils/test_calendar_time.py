@@ -77,10 +77,10 @@ def test_figures_show_round_dates(hours, labels, common):
     axes.plot([0.0, hours], [0.0, 1.0])
     style.label_time([axes], "h", "2026-01-05T00:00:00")
     figure.draw_without_rendering()
-    shown = [tick.get_text() for tick in axes.get_xticklabels()]
+    tick_labels = [tick.get_text() for tick in axes.get_xticklabels()]
     assert common in axes.get_xlabel()
-    assert set(labels) <= set(shown), shown
-    assert len(shown) <= 7
+    assert set(labels) <= set(tick_labels), tick_labels
+    assert len(tick_labels) <= 7
 
 
 @pytest.mark.parametrize("start", ["2026-03-28 22:00", "2026-10-24 22:00"])
@@ -103,8 +103,8 @@ def test_a_midnight_that_the_clock_skips_is_an_origin():
 @pytest.mark.parametrize("last", [59.0, 179.0, 3595.0, 9300.0, 10790.0, 36e3, 216600.0, 259000.0, 6e6, 79e6, 94e6])
 def test_every_span_has_a_few_dates_and_no_complaint(last):
     ticks = style.DateTicks(style.Dates("2026-01-05T00:00:00", "s"), 6)
-    shown = [tick for tick in ticks.tick_values(0.0, last) if 0.0 <= tick <= last]
-    assert 2 <= len(shown) <= 7, shown
+    visible_ticks = [tick for tick in ticks.tick_values(0.0, last) if 0.0 <= tick <= last]
+    assert 2 <= len(visible_ticks) <= 7, visible_ticks
 
 
 DATES = np.array(["2026-01-05T06:00", "2026-01-05T07:30", "2026-01-06T06:00"], "M8[m]")
@@ -122,8 +122,8 @@ def test_dates_in_every_form_are_counted_from_midnight(dates):
     data = Data(dates, np.zeros((3, 1)), ("x",), units={"time": "h"})
     np.testing.assert_allclose(data.times, [6.0, 7.5, 30.0], rtol=1e-15)
     assert data.origin.startswith("2026-01-05T00:00:00")
-    again = Data(dates, np.zeros((3, 1)), ("x",), {"time": "min"}, origin="2026-01-04T00:00:00" + data.origin[19:])
-    np.testing.assert_allclose(again.times, 60 * (data.times + 24.0), rtol=1e-15)
+    shifted = Data(dates, np.zeros((3, 1)), ("x",), {"time": "min"}, origin="2026-01-04T00:00:00" + data.origin[19:])
+    np.testing.assert_allclose(shifted.times, 60 * (data.times + 24.0), rtol=1e-15)
     np.testing.assert_allclose(calendar_time.positions("at", dates, data.origin, "d"), data.times / 24, rtol=1e-15)
 
 
@@ -173,11 +173,11 @@ def test_dates_as_times_are_fitted_as_a_table_of_dates():
         assert result["data"]["time"].attrs["units"] == "h"
         for group, name in (("posterior", "rate"), ("predictions", "y"), ("data", "time")):
             np.testing.assert_array_equal(result[group][name], plain[group][name])
-    ahead = lfm.forecast(computed, model, later, draws=5, progress=False)
+    forecast = lfm.forecast(computed, model, later, draws=5, progress=False)
     expected = lfm.forecast(plain, model, [15.0, 16.0], draws=5, progress=False)
-    np.testing.assert_array_equal(ahead["predictions"]["y"], expected["predictions"]["y"])
+    np.testing.assert_array_equal(forecast["predictions"]["y"], expected["predictions"]["y"])
     held_out = Data(later, [[0.5], [0.6]], ("y0",), {"time": "min"})  # on a clock of its own
-    pd.testing.assert_frame_equal(lfm.score(ahead, held_out), lfm.score(expected, [[0.5], [0.6]]))
+    pd.testing.assert_frame_equal(lfm.score(forecast, held_out), lfm.score(expected, [[0.5], [0.6]]))
     for call in (lambda: lfm.forecast(plain, model, later, draws=5, progress=False),
                  lambda: lfm.fit(model, np.arange(6.0, 14.0), y, at=later, **OPTIONS)):
         with pytest.raises(ValueError, match="(times|at) .* plain numbers"):
@@ -189,9 +189,9 @@ def test_dates_are_counted_in_the_unit_that_the_model_names():
     hours, y = pd.date_range("2026-01-05 06:00", periods=8, freq="h"), np.sin(np.arange(8.0) / 5)[:, None]
     plain = lfm.fit(model, np.arange(6.0, 14.0) / 24, y, **OPTIONS)
     in_hours, numbers = Data(hours, y, ("x",), {"time": "h"}), Data(np.arange(6.0, 14.0), y, ("x",), {"time": "h"})
-    for data, at in (((hours, y), [13 / 24]), ((pd.DataFrame(y, hours, ["x"]),), hours[-1:]), ((in_hours,), [13.0]),
-                     ((numbers,), [13.0])):
-        result = lfm.fit(model, *data, at=at, model_kwargs={"unit": "d"}, **OPTIONS)
+    for data, requested_times in (((hours, y), [13 / 24]), ((pd.DataFrame(y, hours, ["x"]),), hours[-1:]),
+                                  ((in_hours,), [13.0]), ((numbers,), [13.0])):
+        result = lfm.fit(model, *data, at=requested_times, model_kwargs={"unit": "d"}, **OPTIONS)
         np.testing.assert_allclose(result["data"]["time"], np.arange(6.0, 14.0) / 24, rtol=1e-15)
         np.testing.assert_allclose(result["posterior"]["rate"], plain["posterior"]["rate"], rtol=1e-8)
         assert result["trajectories"]["time"].attrs["units"] == "d"
@@ -202,12 +202,12 @@ def test_dates_are_counted_in_the_unit_that_the_model_names():
 def test_held_out_numbers_are_in_the_unit_of_the_result():
     y = np.sin(np.arange(8.0) / 5)[:, None]
     result = lfm.fit(model, Data(np.arange(6.0, 14.0), y, ("x",), {"time": "h"}), **OPTIONS)
-    ahead = lfm.forecast(result, model, [15.0, 16.0], draws=5, progress=False)
-    expected = lfm.score(ahead, [[0.5], [0.6]])
+    forecast = lfm.forecast(result, model, [15.0, 16.0], draws=5, progress=False)
+    expected = lfm.score(forecast, [[0.5], [0.6]])
     held_out = Data([900.0, 960.0], [[0.5], [0.6]], ("x",), {"time": "min"})
-    pd.testing.assert_frame_equal(lfm.score(ahead, held_out), expected)
+    pd.testing.assert_frame_equal(lfm.score(forecast, held_out), expected)
     with pytest.raises(ValueError, match="held_out are dates"):
-        lfm.score(ahead, Data(pd.date_range("2026-01-05", periods=2), [[0.5], [0.6]], ("x",)))
+        lfm.score(forecast, Data(pd.date_range("2026-01-05", periods=2), [[0.5], [0.6]], ("x",)))
 
 
 @pytest.mark.thorough

@@ -12,33 +12,33 @@ from lfm_ppl.utils.compilation import fast_loops, quick_compilation
 OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
 
-@pytest.mark.parametrize(("before", "after"), [
+@pytest.mark.parametrize(("initial_flags", "expected_flags"), [
     (None, f"--xla_backend_extra_options={OPTION}=1000000"),
     ("--xla_force_host_platform_device_count=2",
      f"--xla_force_host_platform_device_count=2 --xla_backend_extra_options={OPTION}=1000000"),
     ("--xla_backend_extra_options=other=1", f"--xla_backend_extra_options=other=1,{OPTION}=1000000"),
     (f"--xla_backend_extra_options={OPTION}=5", f"--xla_backend_extra_options={OPTION}=5"),
 ])
-def test_fast_loops_join_the_flags_that_are_there(monkeypatch, before, after):
-    if before is None:
+def test_fast_loops_join_the_flags_that_are_there(monkeypatch, initial_flags, expected_flags):
+    if initial_flags is None:
         monkeypatch.delenv("XLA_FLAGS", raising=False)
     else:
-        monkeypatch.setenv("XLA_FLAGS", before)
+        monkeypatch.setenv("XLA_FLAGS", initial_flags)
     fast_loops()
-    assert os.environ["XLA_FLAGS"] == after
+    assert os.environ["XLA_FLAGS"] == expected_flags
     fast_loops()
-    assert os.environ["XLA_FLAGS"] == after, "once is enough"
+    assert os.environ["XLA_FLAGS"] == expected_flags, "once is enough"
 
 
-@pytest.mark.parametrize("before", [None, "--xla_dump_to=here --xla_backend_optimization_level=2"])
-def test_what_is_set_comes_after_quick_compilation_and_so_wins(monkeypatch, before):
-    if before is None:
+@pytest.mark.parametrize("initial_flags", [None, "--xla_dump_to=here --xla_backend_optimization_level=2"])
+def test_what_is_set_comes_after_quick_compilation_and_so_wins(monkeypatch, initial_flags):
+    if initial_flags is None:
         monkeypatch.delenv("XLA_FLAGS", raising=False)
     else:
-        monkeypatch.setenv("XLA_FLAGS", before)
+        monkeypatch.setenv("XLA_FLAGS", initial_flags)
     quick_compilation(1)
     assert os.environ["XLA_FLAGS"].startswith("--xla_backend_optimization_level=1")
-    assert os.environ["XLA_FLAGS"].endswith("" if before is None else f" {before}")
+    assert os.environ["XLA_FLAGS"].endswith("" if initial_flags is None else f" {initial_flags}")
 
 
 @pytest.mark.parametrize(("version", "switches"), [((0, 10, 2), 3), ((0, 12, 0), 2), ((0, 13, 0), 1)])

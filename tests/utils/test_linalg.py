@@ -33,7 +33,7 @@ def test_products(shapes):
 
 @pytest.mark.parametrize("shapes", [((3, 4), (4, 4)), ((5, 2, 3), (3, 3)), ((2, 3), (5, 3, 3)), ((0, 2), (2, 2))])
 def test_derivatives_of_products(shapes):
-    """In both modes, of second order too, and beside a constant: as those of A P A' by the product rule."""
+    """In both modes, of second order too, and beside a constant: equal to derivatives of A P A' by the product rule."""
     rng = np.random.default_rng(3)
     a, change, turn, weight = (rng.normal(size=size) for size in (shapes[0], shapes[0], shapes[1], shapes[1]))
     p, change_of_p = turn + np.swapaxes(turn, -1, -2), weight + np.swapaxes(weight, -1, -2)
@@ -118,9 +118,9 @@ def test_a_pivoted_root_is_as_accurate_as_a_matrix_that_is_singular_but_for_roun
 
 def test_degenerate_pivots_are_reported_and_replaced():
     p = jnp.diag(jnp.array([2.0, 0.0, -1.0, 1e-3]))
-    kept = cholesky(p, floor=1e-2)
-    assert kept.degenerate.tolist() == [False, True, True, True]
-    assert np.allclose(jnp.diagonal(kept.chol), np.sqrt([2.0, 1e-2, 1e-2, 1e-2]))
+    factor = cholesky(p, floor=1e-2)
+    assert factor.degenerate.tolist() == [False, True, True, True]
+    assert np.allclose(jnp.diagonal(factor.chol), np.sqrt([2.0, 1e-2, 1e-2, 1e-2]))
     assert jnp.diagonal(cholesky(p).chol)[1] == 1.0
     assert jnp.diagonal(cholesky(p, keep=False).chol)[1] == 0.0
 
@@ -173,8 +173,8 @@ def test_derivatives_of_a_factor_are_those_of_its_operations(keep, floor, dead):
     root = np.random.default_rng(0).normal(size=(4, 5)) * live[:, None]
     weights = np.random.default_rng(1).normal(size=(2, 4, 4))
 
-    both = (derivatives(f, keep, root, live, weights, np.array(floor)) for f in (at_once, by_columns))
-    for result, expected in zip(*both, strict=True):
+    results = (derivatives(f, keep, root, live, weights, np.array(floor)) for f in (at_once, by_columns))
+    for result, expected in zip(*results, strict=True):
         np.testing.assert_allclose(result, expected, rtol=1e-11, atol=1e-12 * np.abs(expected).max())
 
 
@@ -198,12 +198,12 @@ def test_density_of_what_is_not_missing(missing):
         chol = cholesky(matrix).chol
         return log_density(solve_lower(chol, some), chol, jnp.isfinite(residual))
 
-    given = jnp.where(present, residual, jnp.nan)
-    kept = np.ix_(present, present)
-    expected = stats.multivariate_normal.logpdf(residual[present], cov=covariance[kept]) if present.any() else 0.0
-    assert float(density(given, jnp.asarray(covariance))) == pytest.approx(expected, rel=1e-13)
-    by_residual, by_covariance = jax.grad(density, argnums=(0, 1))(given, jnp.asarray(covariance))
+    masked_residual = jnp.where(present, residual, jnp.nan)
+    block = np.ix_(present, present)
+    expected = stats.multivariate_normal.logpdf(residual[present], cov=covariance[block]) if present.any() else 0.0
+    assert float(density(masked_residual, jnp.asarray(covariance))) == pytest.approx(expected, rel=1e-13)
+    by_residual, by_covariance = jax.grad(density, argnums=(0, 1))(masked_residual, jnp.asarray(covariance))
     assert np.isfinite(by_residual).all() and np.isfinite(by_covariance).all()
     assert not by_residual[~present].any() and not by_covariance[~present].any()
-    whole = jnp.stack([given, 2.0 * given])
-    assert np.allclose(jax.vmap(density, (0, None))(whole, covariance), [density(one, covariance) for one in whole])
+    batch = jnp.stack([masked_residual, 2.0 * masked_residual])
+    assert np.allclose(jax.vmap(density, (0, None))(batch, covariance), [density(row, covariance) for row in batch])

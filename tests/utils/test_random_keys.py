@@ -1,4 +1,4 @@
-"""Keys that are picked on the host are those of JAX, of which few programs make any number."""
+"""Keys that are picked on the host equal the keys of JAX; few programs make any number of keys."""
 
 import jax
 import numpy as np

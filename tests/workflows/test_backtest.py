@@ -33,19 +33,19 @@ def test_forecasts_are_those_of_the_data_up_to_the_origin(linear):
     assert dict(scores["crps"].sizes) == {"forecaster": 2, "origin": 3, "horizon": 2, "output": 2}
     np.testing.assert_array_equal(scores["origin"], TIMES[3:6])
     np.testing.assert_array_equal(scores["time"], [TIMES[4:6], TIMES[5:7], TIMES[6:8]])
-    own = scores.sel(forecaster="model")
+    model_scores = scores.sel(forecaster="model")
     for row, origin in enumerate((3, 4, 5)):
-        ahead = slice(origin + 1, origin + 3)
-        mean, covariance = motif.posterior(y[:origin + 1], TIMES[ahead], **motif.THETA, times=TIMES[:origin + 1])
+        horizon = slice(origin + 1, origin + 3)
+        mean, covariance = motif.posterior(y[:origin + 1], TIMES[horizon], **motif.THETA, times=TIMES[:origin + 1])
         mean, sd = mean[-4:].reshape(2, 2), np.sqrt(np.diag(covariance)[-4:] + 0.04).reshape(2, 2)
-        np.testing.assert_allclose(own["mean"][row], mean, atol=1e-5)
-        np.testing.assert_allclose(own["log_score"][row], stats.norm.logpdf(y[ahead], mean, sd), atol=1e-4)
-        np.testing.assert_allclose(own["error"][row], y[ahead] - mean, atol=1e-5)
-    assert np.isnan(own["crps"].values[2, 0, 1])  # missing at row 6
+        np.testing.assert_allclose(model_scores["mean"][row], mean, atol=1e-5)
+        np.testing.assert_allclose(model_scores["log_score"][row], stats.norm.logpdf(y[horizon], mean, sd), atol=1e-4)
+        np.testing.assert_allclose(model_scores["error"][row], y[horizon] - mean, atol=1e-5)
+    assert np.isnan(model_scores["crps"].values[2, 0, 1])  # missing at row 6
     table = linear.table
     assert table.index.tolist() == [(who, name) for who in ("model", "persistence") for name in ("a", "b", "all")]
     assert table["n"].tolist() == [6, 4, 10] * 2
-    np.testing.assert_allclose(table.loc[("model", "all"), "log_score"], np.nanmean(own["log_score"]))
+    np.testing.assert_allclose(table.loc[("model", "all"), "log_score"], np.nanmean(model_scores["log_score"]))
     wins = linear.wins()
     assert wins["origins"].tolist() == [3, 3, 3]
     assert (wins[["rmse", "crps", "log_score"]] <= 3).all(axis=None)

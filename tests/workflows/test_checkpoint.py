@@ -103,7 +103,7 @@ def stop_after(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def whole():
+def full_run():
     """Results of runs that nobody stops and nothing keeps, in blocks as long as they like."""
     return functools.cache(fit)
 
@@ -113,17 +113,17 @@ def whole():
     pytest.param("nuts", bent, marks=pytest.mark.slow),
     pytest.param("ram", bent, marks=pytest.mark.slow),
     pytest.param("pmmh", relaxation, marks=pytest.mark.slow)])
-def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, model, whole, tmp_path, stop_after):
-    expected = whole(sampler, model=model)
+def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, model, full_run, tmp_path, stop_after):
+    expected = full_run(sampler, model=model)
     assert (ANCHOR in ResultView.of(expected).attrs) == (model is bent)
     stop_after(0, steps=3)
     with pytest.raises(KeyboardInterrupt, match="warm-up"):
         fit(sampler, model=model, checkpoint=tmp_path / "run")
     stop_after(3)
     partial = fit(sampler, model=model, checkpoint=tmp_path / "run", resume=True)
-    said = ResultView.of(partial).attrs["partial"]
+    note = ResultView.of(partial).attrs["partial"]
     count = ResultView.of(partial).posterior.sizes["draw"]
-    assert 3 <= count < 6 and said.startswith(f"{count} of 6 draws")
+    assert 3 <= count < 6 and note.startswith(f"{count} of 6 draws")
     for name in ("posterior", "sample_stats"):
         xr.testing.assert_identical(ResultView.of(partial).group(name),
                                     ResultView.of(expected).group(name).isel(draw=slice(count)))
@@ -135,7 +135,7 @@ def test_a_run_that_is_stopped_goes_on_to_the_same_draws(sampler, model, whole, 
 
 
 @pytest.mark.thorough
-def test_a_stop_after_sampling_costs_no_draw(whole, tmp_path, monkeypatch):
+def test_a_stop_after_sampling_costs_no_draw(full_run, tmp_path, monkeypatch):
     sampler = "ram"
 
     def stop(*arguments, lower=False, **keywords):
@@ -146,18 +146,18 @@ def test_a_stop_after_sampling_costs_no_draw(whole, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("lfm_ppl.workflows.fit_results.trajectories", stop)
         partial = fit(sampler, checkpoint=tmp_path)
-    said = ResultView.of(partial).attrs["partial"]
-    assert "trajectories" in said
+    note = ResultView.of(partial).attrs["partial"]
+    assert "trajectories" in note
     assert "log_likelihood" in ResultView.of(partial).groups and "trajectories" not in ResultView.of(partial).groups
-    xr.testing.assert_identical(ResultView.of(partial).posterior, ResultView.of(whole(sampler)).posterior)
+    xr.testing.assert_identical(ResultView.of(partial).posterior, ResultView.of(full_run(sampler)).posterior)
     # Nothing is searched or sampled again.
     for module in ("workflows.fit", "workflows.fit_starts", "inference.laplace_start"):
         monkeypatch.setattr(f"lfm_ppl.{module}.mode_of", stop)
-    assert_same(fit(sampler, checkpoint=tmp_path, resume=True), whole(sampler))
+    assert_same(fit(sampler, checkpoint=tmp_path, resume=True), full_run(sampler))
 
 
 @pytest.mark.thorough
-def test_a_run_that_nothing_keeps_gives_what_it_has(whole, monkeypatch):
+def test_a_run_that_nothing_keeps_gives_what_it_has(full_run, monkeypatch):
     monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
     adapt = sampling._BlockLength.adapt
     calls = []
@@ -173,7 +173,7 @@ def test_a_run_that_nothing_keeps_gives_what_it_has(whole, monkeypatch):
         fit("nuts")
     assert ResultView.of(raised.value.result).attrs["partial"].startswith("3 of 6 draws")
     np.testing.assert_array_equal(ResultView.of(raised.value.result).posterior["noise"],
-                                  ResultView.of(whole("nuts")).posterior["noise"][:, :3])
+                                  ResultView.of(full_run("nuts")).posterior["noise"][:, :3])
 
 
 # Refusals
@@ -209,10 +209,10 @@ def wider(times, y=None):
     ({"model": lfm.approximate(relaxation, steps=2)}, "steps"),
 ])
 def test_another_run_is_not_resumed(unfinished, changes, name):
-    before = {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()}
+    initial_contents = {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()}
     with pytest.raises(ValueError, match=f"differs.*{name}"):
         fit("ram", checkpoint=unfinished, resume=True, **changes)
-    assert {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()} == before
+    assert {path: path.read_bytes() for path in unfinished.rglob("*") if path.is_file()} == initial_contents
 
 
 @pytest.mark.thorough
@@ -228,13 +228,13 @@ def test_a_run_of_other_versions_or_in_use_is_not_resumed(unfinished, monkeypatc
 
 
 @pytest.mark.thorough
-def test_a_finished_run_is_read(whole, tmp_path, monkeypatch):
-    expected = whole("ram")
+def test_a_finished_run_is_read(full_run, tmp_path, monkeypatch):
+    expected = full_run("ram")
     fit("ram", checkpoint=tmp_path)
-    before = (tmp_path / "posterior.nc").stat()
+    initial_stat = (tmp_path / "posterior.nc").stat()
     monkeypatch.setattr(sampling, "run_chains", lambda *arguments: pytest.fail("it was sampled"))
     assert_same(fit("ram", checkpoint=tmp_path, resume=True), expected)
-    assert (tmp_path / "posterior.nc").stat().st_mtime_ns == before.st_mtime_ns
+    assert (tmp_path / "posterior.nc").stat().st_mtime_ns == initial_stat.st_mtime_ns
     with pytest.raises(ValueError, match="seed"):
         fit("ram", checkpoint=tmp_path, resume=True, seed=1)
     with pytest.raises(FileExistsError):
@@ -267,11 +267,14 @@ def test_nothing_is_left_where_nothing_was_sampled(tmp_path, monkeypatch):
 
 
 @pytest.mark.thorough
-def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
-    result = whole("map")
+def test_a_check_goes_on_where_it_was_stopped(full_run, tmp_path, monkeypatch):
+    result = full_run("map")
     monkeypatch.setattr("lfm_ppl.inference.draw_batches._SEQUENTIAL_BATCH", 2)
-    check = lambda **more: lfm.check_accuracy(  # noqa: E731
-        result, relaxation, reference="particles", particles=20, draws=6, progress=False, **more).dataset
+
+    def check(**more):
+        return lfm.check_accuracy(
+            result, relaxation, reference="particles", particles=20, draws=6, progress=False, **more).dataset
+
     expected = check()
 
     def stopping(self, done):
@@ -283,15 +286,15 @@ def test_a_check_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             check(checkpoint=tmp_path)
     put = checkpoints.Batches.put
-    again = []
+    batch_starts = []
 
     def record_and_put(self, start, batch):
-        again.append(start)
+        batch_starts.append(start)
         put(self, start, batch)
 
     monkeypatch.setattr(checkpoints.Batches, "put", record_and_put)
     xr.testing.assert_identical(check(checkpoint=tmp_path, resume=True), expected)
-    assert again == [4], "the first draws were not worked again"
+    assert batch_starts == [4], "the first draws were not worked again"
 
 
 # Progress
@@ -362,7 +365,7 @@ def start(folder, *words):
                             text=True)
 
 
-def drawn(folder):
+def count_draws(folder):
     """Return how many draws are on disk."""
     try:
         with np.load(folder / "run" / "checkpoint" / "state.npz") as file:
@@ -378,7 +381,7 @@ def stopped(folder):
     """Run chains that would take hours, and stop them when there are draws: the process, what it said, seconds."""
     process = start(folder, *RUN)
     until = time.monotonic() + 200
-    while not drawn(folder) and process.poll() is None and time.monotonic() < until:
+    while not count_draws(folder) and process.poll() is None and time.monotonic() < until:
         time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     sent = time.monotonic()
@@ -393,8 +396,8 @@ def test_ctrl_c_leaves_a_usable_result_within_ten_seconds(tmp_path):
     result = lfm.load(tmp_path / "run")
     count = ResultView.of(result).posterior.sizes["draw"]
     assert 0 < count < 1000000
-    for said in (ResultView.of(result).attrs["partial"], out, (tmp_path / "run" / "summary.csv").read_text()):
-        assert f"{count} of 1000000 draws" in said
+    for text in (ResultView.of(result).attrs["partial"], out, (tmp_path / "run" / "summary.csv").read_text()):
+        assert f"{count} of 1000000 draws" in text
 
 
 @pytest.mark.thorough
@@ -404,12 +407,12 @@ def test_a_finished_run_is_left_alone_by_the_command(tmp_path, monkeypatch):
     monkeypatch.setattr("lfm_ppl.plots.save_figures", lambda *arguments, **keywords: [])
     line = ["fit", "relaxation.py", "--sampler", "map", "--samples", "8", "--quiet", "--out", "run"]
     assert main(line) == 0
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()}
+    modification_times = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()}
     assert main([*line, "--resume"]) == 0
     for words in ([*line, "--resume", "--seed", "2"], [*line, "--resume", "--overwrite"], line,
                   [*line[:-2], "--resume"]):
         assert main(words) == 2
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()} == before
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()} == modification_times
 
 
 KILLS = 25
@@ -430,11 +433,11 @@ def unkilled(tmp_path_factory):
 
     def run(sampler):
         folder = tmp_path_factory.mktemp(sampler)
-        began = time.monotonic()
+        begin = time.monotonic()
         process = start(folder, "--sampler", sampler, *TO_KILL[sampler])
         out, _ = process.communicate(timeout=600)
         assert process.returncode == 0, out
-        return folder, lfm.load(folder / "run"), time.monotonic() - began
+        return folder, lfm.load(folder / "run"), time.monotonic() - begin
 
     return functools.cache(run)
 
@@ -443,7 +446,7 @@ def unkilled(tmp_path_factory):
 @pytest.mark.parametrize("piece", range(PIECES))
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_killed_at_any_moment_it_goes_on_to_the_same_draws(sampler, piece, unkilled):
-    folder, expected, took = unkilled(sampler)
+    folder, expected, duration = unkilled(sampler)
     kills = KILLS // PIECES
     chance = random.Random(f"{sampler} {piece}")
     while kills > 0:
@@ -452,13 +455,13 @@ def test_killed_at_any_moment_it_goes_on_to_the_same_draws(sampler, piece, unkil
         while True:
             process = start(folder, "--sampler", sampler, *TO_KILL[sampler], *resume)
             try:
-                out, _ = process.communicate(timeout=chance.uniform(0.0, 1.1 * took) if kills > 0 else 600)
+                out, _ = process.communicate(timeout=chance.uniform(0.0, 1.1 * duration) if kills > 0 else 600)
             except subprocess.TimeoutExpired:
-                before = drawn(folder)
+                stored_count = count_draws(folder)
                 process.kill()
                 process.communicate()
                 kills -= 1
-                assert drawn(folder) >= before
+                assert count_draws(folder) >= stored_count
                 for path in (folder / "run").glob("posterior.nc"):
                     lfm.load(path)  # it is whole, whenever the process was killed
                 resume = ["--resume"]

@@ -49,7 +49,7 @@ def nuts(y):
 
 
 @pytest.fixture(scope="module")
-def known(y):
+def known_fit(y):
     """Independent draws for parameters that are all but known."""
     return quiet_fit(motif.model, TIMES, y, sampler="map", samples=2000, trajectory_draws=2000, at=FORECAST, seed=3,
                      truth={"times": TIMES, "deterministics": {"rate": np.cos(TIMES)}},
@@ -95,7 +95,7 @@ def test_groups_and_dimensions(nuts):
         assert {variable: dataset[variable].dims for variable in dataset.data_vars} == variables
 
 
-def test_coordinates_carry_names_times_and_units(nuts, known, y):
+def test_coordinates_carry_names_times_and_units(nuts, known_fit, y):
     posterior, paths, observed = (group(nuts, name) for name in ("posterior", "trajectories", "data"))
     assert posterior["output"].values.tolist() == ["a", "b"]
     assert (paths["force"].values.tolist(), paths["state"].values.tolist()) == (["drive"], ["x0", "x1"])
@@ -112,7 +112,7 @@ def test_coordinates_carry_names_times_and_units(nuts, known, y):
     np.testing.assert_array_equal(group(nuts, "observed_data")["y"], y[rows, outputs])
     assert (paths["forces"].attrs["units"], observed["y"].attrs["units"]) == ("1/h", "nM")
     np.testing.assert_array_equal(group(nuts, "truth")["outputs"], np.ones((len(TIMES), 2)))  # the states themselves
-    truth = group(known, "truth")
+    truth = group(known_fit, "truth")
     assert set(truth.data_vars) == {"deterministics"}
     np.testing.assert_array_equal(truth["deterministics"].sel(deterministic="rate"), np.cos(TIMES))
 
@@ -162,23 +162,23 @@ def test_conditionals_equal_the_exact_ones_at_every_draw(nuts, y):
     residual = group(nuts, "one_step_ahead")["residual"].values
     np.testing.assert_array_equal(np.isnan(residual).all((0, 1)), np.isnan(y))
     posterior, conditional = group(nuts, "posterior"), group(nuts, "log_likelihood")["y"]
-    ahead = group(nuts, "one_step_ahead")["log_density"]
+    one_step_densities = group(nuts, "one_step_ahead")["log_density"]
     for chain, draw in ((0, 0), (1, 17), (1, 39)):
         theta = {name: posterior[name].values[chain, draw] for name in motif.THETA}
-        whole = motif.log_density(y, **theta)
-        np.testing.assert_allclose(ahead.values[chain, draw].sum(), whole, rtol=1e-8)
+        joint_density = motif.log_density(y, **theta)
+        np.testing.assert_allclose(one_step_densities.values[chain, draw].sum(), joint_density, rtol=1e-8)
         for index, entry in enumerate(zip(*np.nonzero(np.isfinite(y)), strict=True)):
             without = y.copy()
             without[entry] = np.nan
-            exact = whole - motif.log_density(without, **theta)
+            exact = joint_density - motif.log_density(without, **theta)
             np.testing.assert_allclose(conditional.values[chain, draw, index], exact, rtol=1e-8, atol=1e-9)
         for row in range(len(TIMES)):
-            before = y.copy()
-            before[row:] = np.nan
+            y_before = y.copy()
+            y_before[row:] = np.nan
             until = y.copy()
             until[row + 1 :] = np.nan
-            step = motif.log_density(until, **theta) - motif.log_density(before, **theta)
-            np.testing.assert_allclose(ahead.values[chain, draw, row], step, rtol=1e-8, atol=1e-9)
+            step = motif.log_density(until, **theta) - motif.log_density(y_before, **theta)
+            np.testing.assert_allclose(one_step_densities.values[chain, draw, row], step, rtol=1e-8, atol=1e-9)
 
 
 def one_parameter(times, y=None):
@@ -203,7 +203,7 @@ def density():
     def log_likelihood(y):
         present = np.isfinite(y).ravel()
         normal = [stats.multivariate_normal(cov=c[np.ix_(present, present)]) for c in covariances]
-        return np.array([one.logpdf(y.ravel()[present]) for one in normal])
+        return np.array([law.logpdf(y.ravel()[present]) for law in normal])
 
     return nodes, stats.norm.logpdf(nodes), log_likelihood
 
@@ -245,14 +245,14 @@ def test_ram_posterior_on_a_line(line, y, density):
     weights /= weights.sum()
     mean, size = weights @ nodes, arviz_data.summary(line).loc["decay", "ess_bulk"]
     sd = np.sqrt(weights @ (nodes - mean) ** 2)
-    drawn = (np.log(group(line, "posterior")["decay"].values) - np.log(0.5)) / 0.5
-    assert abs(drawn.mean() - mean) < 4.5 * sd / np.sqrt(size)
-    assert abs(drawn.std() / sd - 1) < 4.5 / np.sqrt(size)
+    scaled_draws = (np.log(group(line, "posterior")["decay"].values) - np.log(0.5)) / 0.5
+    assert abs(scaled_draws.mean() - mean) < 4.5 * sd / np.sqrt(size)
+    assert abs(scaled_draws.std() / sd - 1) < 4.5 / np.sqrt(size)
     statistics = group(line, "sample_stats")
     assert set(statistics.data_vars) == {"acceptance_rate", "accepted", "lp"}
     assert 0.3 < float(statistics["accepted"].mean()) < 0.6  # towards 0.44 in one dimension
-    at = CubicSpline(nodes, values)(drawn[0, :20])
-    np.testing.assert_allclose(statistics["lp"].values[0, :20], at, atol=1e-5)
+    expected_lp = CubicSpline(nodes, values)(scaled_draws[0, :20])
+    np.testing.assert_allclose(statistics["lp"].values[0, :20], expected_lp, atol=1e-5)
 
 
 # Trajectories
@@ -268,15 +268,15 @@ def assert_moments(draws, mean, covariance):
     """Draws (n, d) against a Gaussian: whitened, they are independent standard normals."""
     count = len(draws)
     values, vectors = np.linalg.eigh(covariance)
-    kept = values > 1e-9 * values.max()
-    white = (draws - mean) @ vectors[:, kept] / np.sqrt(values[kept])
+    is_positive = values > 1e-9 * values.max()
+    white = (draws - mean) @ vectors[:, is_positive] / np.sqrt(values[is_positive])
     assert np.abs(white.mean(0)).max() < 4.5 / np.sqrt(count)
-    error = np.abs(white.T @ white / count - np.eye(kept.sum()))
+    error = np.abs(white.T @ white / count - np.eye(is_positive.sum()))
     assert error.max() < 4.5 * np.sqrt(2.0 / count)
 
 
-def test_trajectories_have_the_exact_joint_distribution(known, exact):
-    paths = group(known, "trajectories")
+def test_trajectories_have_the_exact_joint_distribution(known_fit, exact):
+    paths = group(known_fit, "trajectories")
     mean, covariance = exact
     start = 2 * len(TIMES)
     forces = paths["forces"].values[0, :, :, 0]
@@ -285,13 +285,13 @@ def test_trajectories_have_the_exact_joint_distribution(known, exact):
     sd = np.sqrt(np.diag(covariance)[start:start + len(FORECAST)])
     assert sd[-1] > sd[-2] > sd[-3]  # a forecast widens towards the prior
     np.testing.assert_array_equal(paths["outputs"], paths["states"])
-    ahead, at = group(known, "predictions"), slice(start + len(FORECAST), None)
-    np.testing.assert_array_equal(ahead["outputs"], paths["outputs"])
-    np.testing.assert_allclose(ahead["y_mean"].values[0, 0].ravel(), mean[at], atol=2e-6)
+    forecast, forecast_part = group(known_fit, "predictions"), slice(start + len(FORECAST), None)
+    np.testing.assert_array_equal(forecast["outputs"], paths["outputs"])
+    np.testing.assert_allclose(forecast["y_mean"].values[0, 0].ravel(), mean[forecast_part], atol=2e-6)
 
 
-def test_posterior_predictive_is_the_smoothed_state_and_noise(known, exact, y):
-    replicated = group(known, "posterior_predictive")["y"].values[0]
+def test_posterior_predictive_is_the_smoothed_state_and_noise(known_fit, exact, y):
+    replicated = group(known_fit, "posterior_predictive")["y"].values[0]
     mean, covariance = exact
     seen = np.flatnonzero(np.isfinite(y))
     noise = motif.THETA["noise_sd"] ** 2 * np.eye(len(seen))
@@ -301,12 +301,12 @@ def test_posterior_predictive_is_the_smoothed_state_and_noise(known, exact, y):
 def test_bands_are_the_quantiles_of_the_mixture_over_the_draws(nuts, y):
     """Against the exact posterior of the force at every draw of the parameters, by dense algebra."""
     paths = group(nuts, "trajectories")
-    drawn = group(nuts, "posterior").sel(draw=paths["draw"])
+    parameters = group(nuts, "posterior").sel(draw=paths["draw"])
     means, sds = [], []
     for chain in range(2):
         for draw in range(paths.sizes["draw"]):
-            at = {name: value.isel(chain=chain, draw=draw).values for name, value in drawn.items()}
-            mean, covariance = motif.posterior(y, FORECAST, **{name: at[name] for name in motif.THETA})
+            values = {name: value.isel(chain=chain, draw=draw).values for name, value in parameters.items()}
+            mean, covariance = motif.posterior(y, FORECAST, **{name: values[name] for name in motif.THETA})
             start = 2 * len(TIMES)
             means.append(mean[start:start + len(FORECAST)])
             sds.append(np.sqrt(np.diag(covariance)[start:start + len(FORECAST)]))
@@ -317,8 +317,8 @@ def test_bands_are_the_quantiles_of_the_mixture_over_the_draws(nuts, y):
         np.testing.assert_allclose(share, p, atol=1e-4)
 
 
-def test_deterministics_follow_the_path_and_have_its_bands(known, y):
-    paths = group(known, "trajectories")
+def test_deterministics_follow_the_path_and_have_its_bands(known_fit, y):
+    paths = group(known_fit, "trajectories")
     rate = paths["deterministics"].sel(deterministic="rate")
     np.testing.assert_allclose(rate, np.exp(paths["forces"].sel(force="drive")), rtol=1e-12)
     assert rate.attrs["units"] == "1/h"
@@ -334,17 +334,17 @@ def test_deterministics_follow_the_path_and_have_its_bands(known, y):
     assert (np.abs(np.exp(result.sel(statistic="mean")) - expected) < 4.5 * error).all()
 
 
-def test_mode_of_known_parameters(known):
-    attrs = ResultView.of(known).attrs
+def test_mode_of_known_parameters(known_fit):
+    attrs = ResultView.of(known_fit).attrs
     assert (attrs["sampler"], attrs["chains"], attrs["warmup"]) == ("map", 1, 0)
     assert attrs["map_converged"] == 1
-    assert "sample_stats" not in ResultView.of(known).groups
-    posterior = group(known, "posterior")
+    assert "sample_stats" not in ResultView.of(known_fit).groups
+    posterior = group(known_fit, "posterior")
     np.testing.assert_allclose(posterior["noise_sd"], motif.THETA["noise_sd"], rtol=10 * NEAR)
     # With known parameters the evidence is the likelihood
     np.testing.assert_allclose(attrs["log_evidence"], motif.log_density(motif.data(), **motif.THETA), atol=1e-4)
     # Independent draws have no chains: nothing to diagnose, and no trace to look at.
-    table = arviz_data.summary(known)
+    table = arviz_data.summary(known_fit)
     assert list(table) == ["mode", "mean", "sd", "q2.5", "q97.5"]
     expected = [*motif.THETA["decay"], motif.THETA["noise_sd"]]
     np.testing.assert_allclose(table.loc[["decay[a]", "decay[b]", "noise_sd"], "mode"], expected, rtol=10 * NEAR)
@@ -358,7 +358,10 @@ def shared(times, y=None):
     noise_sd = numpyro.sample("noise_sd", dist.LogNormal(-1.5, 0.3))
     with numpyro.plate("series", 2):
         decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
-        build = lambda p: motif.build(p[None], 1.5, noise_sd)  # noqa: E731
+
+        def build(p):
+            return motif.build(p[None], 1.5, noise_sd)
+
         numpyro.sample("y", lfm.panel(build, decay, times), obs=y)
 
 
@@ -377,11 +380,11 @@ def test_panel():
     assert sizes["trajectories"] == {"chain": 2, "draw": 2, "series": 2, "time": 2, "force": 1, "state": 1, "output": 1,
                                      "deterministic": 1, "statistic": 3}
     assert sizes["data"] == {"series": 2, "time": 4, "output": 1} and sizes["observed_data"] == {"observation": 7}
-    posterior, ahead = group(result, "posterior"), group(result, "one_step_ahead")["log_density"].values
+    posterior, one_step_densities = group(result, "posterior"), group(result, "one_step_ahead")["log_density"].values
     for series in range(2):
         theta = (posterior["decay"].values[1, 9, series, None], 1.5, posterior["noise_sd"].values[1, 9])
         exact = motif.log_density(y[series], *theta, times=times)
-        np.testing.assert_allclose(ahead[1, 9, series].sum(), exact, rtol=1e-8)
+        np.testing.assert_allclose(one_step_densities[1, 9, series].sum(), exact, rtol=1e-8)
     with pytest.raises(ValueError, match=r"\(2, 4, 1\)"):
         lfm.fit(shared, times, y[:, :3])
 
@@ -397,11 +400,11 @@ def test_the_same_seed_gives_the_same_result(y):
         first = lfm.fit(motif.model, TIMES, y, progress=False, **settings)
     messages = " ".join(str(w.message) for w in warned)
     assert "R-hat" in messages and "decay" in messages
-    again = quiet_fit(motif.model, TIMES, y, **settings)
-    other = quiet_fit(motif.model, TIMES, y, **settings, seed=1)
+    repetition = quiet_fit(motif.model, TIMES, y, **settings)
+    other_seed = quiet_fit(motif.model, TIMES, y, **settings, seed=1)
     for name in ("posterior", "trajectories", "posterior_predictive", "log_likelihood"):
-        xr.testing.assert_identical(group(again, name), group(first, name))
-        assert not group(other, name).equals(group(first, name))
+        xr.testing.assert_identical(group(repetition, name), group(first, name))
+        assert not group(other_seed, name).equals(group(first, name))
     attrs = ResultView.of(first).attrs
     assert (attrs["model"], attrs["thin"]) == ("model", 15)  # five steps for each of three parameters
 
@@ -442,8 +445,8 @@ def test_times_are_known_to_everything_after_sampling(y):
     values = {"decay": jnp.asarray(decay)}
     with numpyro.handlers.seed(rng_seed=0), numpyro.handlers.substitute(data=values):
         trace = numpyro.handlers.trace(converted).get_trace(TIMES, y[:, :1], **keywords)
-    whole = trace["y"]["fn"].log_prob(y[:, :1])
-    np.testing.assert_allclose(group(result, "one_step_ahead")["log_density"][0, 3].sum(), whole, rtol=1e-9)
+    joint_density = trace["y"]["fn"].log_prob(y[:, :1])
+    np.testing.assert_allclose(group(result, "one_step_ahead")["log_density"][0, 3].sum(), joint_density, rtol=1e-9)
 
 
 @pytest.mark.thorough

@@ -1,4 +1,4 @@
-"""Many data sets, each fitted by itself: the numbers of single fits, whatever fails and however often it is stopped."""
+"""Many data sets, each fitted alone: the numbers of single fits, whatever fails and however often it is stopped."""
 
 import functools
 import json
@@ -47,15 +47,16 @@ def folder(tmp_path_factory):
 
 def test_each_result_is_that_of_a_fit(folder):
     _, fits, yielded = folder
-    assert [one.name for one in yielded] == ["plant 0", "plant 1", "plant 2"] and len(fits) == 3
-    own = lfm.fit(motif.model, *data_sets()["plant 2"], seed=fit_tasks.seed_of("plant 2"), progress=False, **OPTIONS)
+    assert [outcome.name for outcome in yielded] == ["plant 0", "plant 1", "plant 2"] and len(fits) == 3
+    single_fit = lfm.fit(motif.model, *data_sets()["plant 2"], seed=fit_tasks.seed_of("plant 2"), progress=False,
+                         **OPTIONS)
     result = yielded[2].result
-    assert tuple(ResultView.of(result).groups) == tuple(ResultView.of(own).groups)
-    for name in ResultView.of(own).groups:
-        one, other = ResultView.of(own).group(name), ResultView.of(result).group(name)
-        assert one.equals(other) and {k: v.attrs for k, v in one.variables.items()} == {
-            k: v.attrs for k, v in other.variables.items()}, name
-    attrs, expected = ResultView.of(result).attrs, ResultView.of(own).attrs
+    assert tuple(ResultView.of(result).groups) == tuple(ResultView.of(single_fit).groups)
+    for name in ResultView.of(single_fit).groups:
+        expected_group, group = ResultView.of(single_fit).group(name), ResultView.of(result).group(name)
+        assert expected_group.equals(group) and {k: v.attrs for k, v in expected_group.variables.items()} == {
+            k: v.attrs for k, v in group.variables.items()}, name
+    attrs, expected = ResultView.of(result).attrs, ResultView.of(single_fit).attrs
     assert json.loads(attrs.pop("warnings")) == json.loads(expected.pop("warnings")) == []
     for measured in ("wall_time_s", "created_at"):
         attrs.pop(measured), expected.pop(measured)
@@ -79,9 +80,9 @@ def test_one_table_and_one_file_over_all(folder):
     assert len(pd.read_csv(out / "summary.csv")) == 8
     posterior = ResultView.of(lfm.load(out / "posteriors.nc")).posterior
     assert posterior["decay"].dims == ("chain", "draw", "data_set", "output")
-    for one in (yielded[0], yielded[2]):
-        for name, values in draws(one.result).items():
-            np.testing.assert_array_equal(posterior[name].sel(data_set=one.name), values)
+    for outcome in (yielded[0], yielded[2]):
+        for name, values in draws(outcome.result).items():
+            np.testing.assert_array_equal(posterior[name].sel(data_set=outcome.name), values)
 
 
 @pytest.mark.thorough
@@ -89,10 +90,11 @@ def test_what_is_stored_is_not_fitted_again(folder, monkeypatch):
     out, _, yielded = folder
     fitted, call = [], fit_tasks.FitDataSet.__call__
     monkeypatch.setattr(fit_tasks.FitDataSet, "__call__", lambda fit, task: fitted.append(task.name) or call(fit, task))
-    again = list(lfm.fit_many(motif.model, data_sets(), checkpoint=out, **OPTIONS))
-    assert [one.stored for one in again] == [True, True, False] and again[2].name == "plant 1" and len(fitted) == 1
+    outcomes = list(lfm.fit_many(motif.model, data_sets(), checkpoint=out, **OPTIONS))
+    assert [outcome.stored for outcome in outcomes] == [True, True, False]
+    assert outcomes[2].name == "plant 1" and len(fitted) == 1
     for name, values in draws(yielded[2].result).items():
-        np.testing.assert_array_equal(draws(again[1].result)[name], values)
+        np.testing.assert_array_equal(draws(outcomes[1].result)[name], values)
     assert not (out / "failed.csv").exists()
 
 
@@ -107,13 +109,13 @@ def test_progress_is_shown_unless_it_is_switched_off(folder, monkeypatch, capfd)
     assert len(lines) == 1
 
 
-def other(times, y=None):
+def wider_model(times, y=None):
     motif.model(times, y, spread=0.5)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("change, message", [
-    ({"samples": 30}, "options is"), ({"seed": 1}, "seed is 0 there and 1 now"), ({"model": other}, "model is"),
+    ({"samples": 30}, "options is"), ({"seed": 1}, "seed is 0 there and 1 now"), ({"model": wider_model}, "model is"),
     ({"data": 1}, "data is")])
 def test_results_of_something_else_are_refused(folder, change, message):
     model, sets = change.pop("model", motif.model), poisoned()
@@ -156,10 +158,10 @@ def test_names_become_files_that_differ():
 
 @pytest.mark.slow
 def test_several_processes_find_the_same_numbers(tmp_path):
-    alone = {one.name: draws(one.result) for one in lfm.fit_many(motif.model, data_sets(4), **OPTIONS)}
-    for one in lfm.fit_many(motif.model, data_sets(4), workers=2, checkpoint=tmp_path, **OPTIONS):
-        for name, values in draws(one.result).items():
-            np.testing.assert_allclose(values, alone[one.name][name], rtol=1e-12)
+    alone = {outcome.name: draws(outcome.result) for outcome in lfm.fit_many(motif.model, data_sets(4), **OPTIONS)}
+    for outcome in lfm.fit_many(motif.model, data_sets(4), workers=2, checkpoint=tmp_path, **OPTIONS):
+        for name, values in draws(outcome.result).items():
+            np.testing.assert_allclose(values, alone[outcome.name][name], rtol=1e-12)
 
 
 # On the command line
@@ -174,8 +176,8 @@ def model(times, y=None):
 @pytest.fixture
 def line(tmp_path, monkeypatch, capsys, folder):
     """Run the command in an empty folder, where a fit takes no time; return (exit code, output, errors)."""
-    _, _, (one, *_) = folder
-    monkeypatch.setattr(fit_tasks, "fit", functools.wraps(lfm.fit)(lambda *given, **named: one.result))
+    _, _, (outcome, *_) = folder
+    monkeypatch.setattr(fit_tasks, "fit", functools.wraps(lfm.fit)(lambda *arguments, **named: outcome.result))
     return command(tmp_path, monkeypatch, capsys)
 
 
@@ -217,11 +219,12 @@ def test_each_of_many_files_and_one_that_cannot_be_read(line, tmp_path):
         f"{k}/{name}" for k in range(2) for name in ("posterior.nc", "report.html", "summary.csv"))
     attrs = lfm.load(written / "1").attrs
     assert attrs["model_file"] == str(tmp_path / "motif.py") and attrs["data"] == "patients/*.csv"
-    before = (written / "0" / "posterior.nc").stat().st_mtime_ns
+    modification_time = (written / "0" / "posterior.nc").stat().st_mtime_ns
     csv(tmp_path / "patients" / "bad.csv", rows(5))
     code, out, err = line("--data patients/*.csv --each --out many")
     assert code == 0 and "2 of 3 tasks are stored already" in err
-    assert (written / "0" / "posterior.nc").stat().st_mtime_ns == before and (written / "bad" / "report.html").is_file()
+    assert (written / "0" / "posterior.nc").stat().st_mtime_ns == modification_time
+    assert (written / "bad" / "report.html").is_file()
 
 
 @pytest.mark.slow
@@ -245,8 +248,8 @@ def test_several_processes_get_a_model_file(tmp_path, monkeypatch, capsys):
     for jobs in (1, 2):
         code, _, _ = command(tmp_path, monkeypatch, capsys, jobs)(f"--data patients/*.csv --each --out jobs-{jobs}")
         assert code == 0
-    one, other = (pd.read_csv(tmp_path / f"jobs-{jobs}" / "summary.csv") for jobs in (1, 2))
-    pd.testing.assert_frame_equal(one, other, rtol=1e-12)
+    serial, parallel = (pd.read_csv(tmp_path / f"jobs-{jobs}" / "summary.csv") for jobs in (1, 2))
+    pd.testing.assert_frame_equal(serial, parallel, rtol=1e-12)
     result = subprocess.run(
         [
             sys.executable,
@@ -262,8 +265,8 @@ def test_several_processes_get_a_model_file(tmp_path, monkeypatch, capsys):
 
 
 def test_series_in_one_file(line, tmp_path):
-    whole = [(*row, name) for name, seed in (("P7", 0), ("P2", 1)) for row in rows(seed)]
-    csv(tmp_path / "all" / "all.csv", whole, "time,a,b,who")
+    table_rows = [(*row, name) for name, seed in (("P7", 0), ("P2", 1)) for row in rows(seed)]
+    csv(tmp_path / "all" / "all.csv", table_rows, "time,a,b,who")
     code, _, _ = line("--data all/all.csv --series who --out many")
     assert code == 0 and list(pd.read_csv(tmp_path / "many" / "summary.csv")["data set"].unique()) == ["P7", "P2"]
 

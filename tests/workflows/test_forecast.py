@@ -38,15 +38,15 @@ def predictions(result):
 
 
 @pytest.fixture(scope="module")
-def known():
+def known_fit():
     """Many draws of parameters that are all but known, and no trajectories."""
     return lfm.fit(motif.model, motif.TIMES, motif.data(), sampler="map", samples=DRAWS, trajectory_draws=0, seed=3,
                    model_kwargs={"spread": NEAR}, progress=False, coords={"output": ["left", "right"]})
 
 
 @pytest.fixture(scope="module")
-def ahead(known):
-    return lfm.forecast(known, motif.model, AT, model_kwargs={"spread": NEAR}, draws=DRAWS, seed=5)
+def forecast(known_fit):
+    return lfm.forecast(known_fit, motif.model, AT, model_kwargs={"spread": NEAR}, draws=DRAWS, seed=5)
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +57,9 @@ def exact():
     return mean[start:], covariance[start:, start:]
 
 
-def test_moments_of_a_linear_model_are_exact(ahead, exact):
+def test_moments_of_a_linear_model_are_exact(forecast, exact):
     mean, covariance = exact
-    result = predictions(ahead)
+    result = predictions(forecast)
     free = np.sqrt(np.diag(covariance)).reshape(-1, 2)
     np.testing.assert_allclose(result["y_mean"].values[0], np.tile(mean.reshape(-1, 2), (DRAWS, 1, 1)), atol=2e-6)
     np.testing.assert_allclose(result["y_sd"][0, 0], np.hypot(free, motif.THETA["noise_sd"]), rtol=2e-6)
@@ -68,9 +68,9 @@ def test_moments_of_a_linear_model_are_exact(ahead, exact):
     np.testing.assert_allclose(high - low, 2 * stats.norm.ppf(0.975) * free, rtol=1e-5)
 
 
-def test_new_data_of_a_linear_model_are_exact_jointly_in_time(ahead, exact):
+def test_new_data_of_a_linear_model_are_exact_jointly_in_time(forecast, exact):
     mean, covariance = exact
-    result = predictions(ahead)
+    result = predictions(forecast)
     for name, noise in (("outputs", 0.0), ("y", motif.THETA["noise_sd"] ** 2)):
         draws = result[name].values[0].reshape(DRAWS, -1)
         root = np.linalg.cholesky(covariance + (noise + 1e-12) * np.eye(len(mean)))
@@ -79,10 +79,10 @@ def test_new_data_of_a_linear_model_are_exact_jointly_in_time(ahead, exact):
         assert np.abs(white @ white.T / DRAWS - np.eye(len(mean))).max() < 4.5 * np.sqrt(2 / DRAWS)
 
 
-def test_groups_coordinates_and_units(ahead, known):
-    result = predictions(ahead)
-    assert "predictions" not in ResultView.of(known).groups  # a new object
-    assert set(ResultView.of(ahead).groups) == {*ResultView.of(known).groups, "predictions"}
+def test_groups_coordinates_and_units(forecast, known_fit):
+    result = predictions(forecast)
+    assert "predictions" not in ResultView.of(known_fit).groups  # a new object
+    assert set(ResultView.of(forecast).groups) == {*ResultView.of(known_fit).groups, "predictions"}
     assert result["y"].dims == ("chain", "draw", "time", "output")
     assert result["forces"].dims == ("chain", "draw", "time", "force")
     np.testing.assert_array_equal(result["time"], AT)
@@ -158,13 +158,13 @@ def test_a_far_forecast_alone_is_that_of_many_times(between_the_wells):
 
 
 @pytest.mark.thorough
-def test_another_model_and_impossible_times_are_refused(known):
+def test_another_model_and_impossible_times_are_refused(known_fit):
     keywords = {"model_kwargs": {"spread": NEAR}}
     for times, name in (([5.0, 4.0], "entry 1"), ([-1.0], "initial time"), ([], "at least one"), ([np.nan], "finite")):
         with pytest.raises(ValueError, match=name):
-            lfm.forecast(known, motif.model, times, **keywords)
+            lfm.forecast(known_fit, motif.model, times, **keywords)
     with pytest.raises(ValueError, match="y must have one row"):
-        lfm.forecast(known, well, AT)  # of one output
+        lfm.forecast(known_fit, well, AT)  # of one output
 
     def louder(times, y=None):
         decay = numpyro.sample("decay", dist.LogNormal(jnp.zeros(2), 1.0).to_event(1))
@@ -173,7 +173,7 @@ def test_another_model_and_impossible_times_are_refused(known):
         numpyro.sample("y", lfm.MarginalLikelihood(motif.build(decay, lengthscale, 2 * noise_sd), times), obs=y)
 
     with pytest.raises(ValueError, match="log likelihood"):
-        lfm.forecast(known, louder, AT, draws=2)
+        lfm.forecast(known_fit, louder, AT, draws=2)
 
 
 @pytest.mark.slow
@@ -209,11 +209,11 @@ def test_noise_of_rows_and_a_missing_keyword_are_named():
     with pytest.warns(UserWarning, match="cannot be predicted"):
         result = lfm.fit(model, times, np.ones((4, 1)), sampler="map", samples=10, trajectory_draws=0, progress=False,
                          model_kwargs=keywords, at=[5.0])
-    for given, error, message in ((None, TypeError, r"needs variances: pass model_kwargs=\{'variances': ...\}"),
-                                  (keywords, ValueError, "differs between rows"),
-                                  ({"variances": np.ones((2, 1, 1))}, ValueError, "2 matrices.* 4 times")):
+    for model_kwargs, error, message in ((None, TypeError, r"needs variances: pass model_kwargs=\{'variances': ...\}"),
+                                         (keywords, ValueError, "differs between rows"),
+                                         ({"variances": np.ones((2, 1, 1))}, ValueError, "2 matrices.* 4 times")):
         with pytest.raises(error, match=message):
-            lfm.forecast(result, model, [5.0], model_kwargs=given, progress=False)
+            lfm.forecast(result, model, [5.0], model_kwargs=model_kwargs, progress=False)
 
 
 def dosed(times, y=None, events=()):
@@ -231,12 +231,12 @@ def test_later_events_follow_those_of_the_fit():
     result = arviz_data.build({
         "posterior": xr.Dataset({"rate": (("chain", "draw"), rate[..., 0])}), "data": observed,
         "constant_data": to_dataset({"AMT": InputTable(np.array([0.0]), np.array([2.0]), "dose:drug")})})
-    both = 2 * np.exp(-5 * rate) + 3 * np.exp(-2 * rate)
+    superposition = 2 * np.exp(-5 * rate) + 3 * np.exp(-2 * rate)
     doses = [lfm.Reset([2.5], "drug"), lfm.Dose([3.0], 3.0, "drug")]
-    for options, expected in (({"inputs": {"AMT": ([3.0], [3.0], "dose:drug")}}, both),
+    for options, expected in (({"inputs": {"AMT": ([3.0], [3.0], "dose:drug")}}, superposition),
                               ({"events": doses}, 3 * np.exp(-2 * rate))):
-        ahead = predictions(lfm.forecast(result, dosed, [5.0], progress=False, **options))
-        np.testing.assert_allclose(ahead["outputs"][..., 0], expected, rtol=1e-8)
+        forecast = predictions(lfm.forecast(result, dosed, [5.0], progress=False, **options))
+        np.testing.assert_allclose(forecast["outputs"][..., 0], expected, rtol=1e-8)
     for options, words in (({"events": [lfm.Dose([1.5], 3.0, "drug")]}, "a dose at time 1.5"),
                            ({"inputs": {"AMT": ([0.0, 1.5], [2.0, 3.0])}}, "'AMT' .* at time 1.5"),
                            ({"inputs": {"AMD": ([3.0], [3.0])}}, "'AMD'.*AMT")):
@@ -278,19 +278,19 @@ def test_noise_of_rows_is_continued_or_constant(lead):
         smoothed = lfm.smooth(system, times, y[series], at=np.array([4.5, 7.0]))
         return smoothed.mean[:, 0], np.sqrt(smoothed.covariance[:, 0, 0] + noise[series].ravel())
 
-    same = np.broadcast_to(rows[..., :1, :, :], rows.shape)
-    for R, inputs, noise in ((rows, {"R": later}, later), (same, None, same[..., :2, :, :])):
-        ahead = predictions(lfm.forecast(result, rowwise, [4.5, 7.0], inputs=inputs, model_kwargs={"R": R},
-                                         progress=False))
+    constant_rows = np.broadcast_to(rows[..., :1, :, :], rows.shape)
+    for R, inputs, noise in ((rows, {"R": later}, later), (constant_rows, None, constant_rows[..., :2, :, :])):
+        forecast = predictions(lfm.forecast(result, rowwise, [4.5, 7.0], inputs=inputs, model_kwargs={"R": R},
+                                            progress=False))
         for series in np.ndindex(lead):
             mean, sd = expected(R, noise, series)
-            np.testing.assert_allclose(ahead["y_mean"].values[(0, 0, *series)][:, 0], mean, atol=1e-8)
-            np.testing.assert_allclose(ahead["y_sd"].values[(0, 0, *series)][:, 0], sd, rtol=1e-8)
-    for inputs, at, words in ((None, [4.5, 7.0], "differs between rows"),
-                              ({"R": later[..., :1, :, :]}, [4.5, 7.0], "'R'"),
-                              ({"R": later}, [1.5, 7.0], "after the data")):
+            np.testing.assert_allclose(forecast["y_mean"].values[(0, 0, *series)][:, 0], mean, atol=1e-8)
+            np.testing.assert_allclose(forecast["y_sd"].values[(0, 0, *series)][:, 0], sd, rtol=1e-8)
+    for inputs, requested_times, words in ((None, [4.5, 7.0], "differs between rows"),
+                                           ({"R": later[..., :1, :, :]}, [4.5, 7.0], "'R'"),
+                                           ({"R": later}, [1.5, 7.0], "after the data")):
         with pytest.raises(ValueError, match=words):
-            lfm.forecast(result, rowwise, at, inputs=inputs, model_kwargs={"R": rows}, progress=False)
+            lfm.forecast(result, rowwise, requested_times, inputs=inputs, model_kwargs={"R": rows}, progress=False)
 
 
 @pytest.mark.thorough
@@ -298,19 +298,21 @@ def test_a_panel_is_forecast_series_by_series():
     def model(times, y=None):
         decay = numpyro.sample("decay", dist.LogNormal(jnp.log(jnp.array([0.5, 1.2])), NEAR).to_event(1))
         with numpyro.plate("series", 2):
-            build = lambda p: motif.build(p["decay"][None], 1.5, 0.2)  # noqa: E731
+            def build(p):
+                return motif.build(p["decay"][None], 1.5, 0.2)
+
             numpyro.sample("y", lfm.panel(build, {"decay": decay}, times), obs=y)
 
     times, y = np.array([0.0, 1.0, 2.0]), np.random.default_rng(0).normal(size=(2, 3, 1))
     result = lfm.fit(model, times, y, sampler="map", samples=30, trajectory_draws=0, progress=False)
-    ahead = lfm.forecast(result, model, [3.0, 5.0])
-    computed = predictions(ahead)
+    forecast = lfm.forecast(result, model, [3.0, 5.0])
+    computed = predictions(forecast)
     assert computed["y"].dims == ("chain", "draw", "series", "time", "output")
     for series, decay in enumerate((0.5, 1.2)):
         system = motif.build(jnp.array([decay]), 1.5, 0.2)
         smoothed = lfm.smooth(system, times, y[series], at=np.array([3.0, 5.0]))
         np.testing.assert_allclose(computed["y_mean"].values[0, 0, series], smoothed.mean[:, :1], atol=1e-5)
-    assert lfm.score(ahead, np.zeros((2, 2, 1))).loc["a", "n"] == 4
+    assert lfm.score(forecast, np.zeros((2, 2, 1))).loc["a", "n"] == 4
 
 
 def one_motif(times, y=None, link=systems.identity):
@@ -337,18 +339,18 @@ def wells(times, y=None):
 @pytest.mark.parametrize("model", [one_motif, softplus_motif, wells], ids=lambda model: model.__name__)
 def test_bands_cover_new_data_over_200_runs(model):
     """Parameters, force, state and data from the prior; fit to 25 rows, predict the 10 after them."""
-    times, known, runs = np.linspace(0.0, 14.0, 35), 25, 200
+    times, data_rows, runs = np.linspace(0.0, 14.0, 35), 25, 200
     prior = numpyro.infer.Predictive(model, num_samples=runs)(jax.random.key(1), times)["y"]
     covered, pit = [], []
     for index, y in enumerate(np.asarray(prior)):
-        past = np.where(np.arange(35)[:, None] < known, y, np.nan)
+        past = np.where(np.arange(35)[:, None] < data_rows, y, np.nan)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", lfm.ConvergenceWarning)
             result = lfm.fit(model, times, past, sampler="nuts", chains=1, warmup=200, samples=400,
                              trajectory_draws=400, at=times, seed=index, progress=False)
-        computed = predictions(result).isel(time=slice(known, None))
+        computed = predictions(result).isel(time=slice(data_rows, None))
         mean, sd = (computed[name].values.reshape(-1, 10) for name in ("y_mean", "y_sd"))
-        share = stats.norm.cdf((y[known:, 0] - mean) / sd).mean(axis=0)
+        share = stats.norm.cdf((y[data_rows:, 0] - mean) / sd).mean(axis=0)
         pit.append(share)
         covered.append((share > 0.025) & (share < 0.975))
     covered = np.array(covered)
@@ -370,15 +372,16 @@ def elimination(times, y=None, limit=50.0, start=3000.0, **options):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("at", [[72.0], pytest.param([42.0, 57.0, 58.5, 60.0, 61.0, 72.0], marks=pytest.mark.slow)],
+@pytest.mark.parametrize("requested_times",
+                         [[72.0], pytest.param([42.0, 57.0, 58.5, 60.0, 61.0, 72.0], marks=pytest.mark.slow)],
                          ids=["sparse", "dense"])
-def test_a_decay_that_is_fast_after_the_data_only(at):
+def test_a_decay_that_is_fast_after_the_data_only(requested_times):
     """Two time constants and more in an explicit step of the simulation."""
     times = np.arange(6.0, 37.0, 6.0)
     data = 3000.0 - 50.0 * times[:, None] + 0.2
     result = lfm.fit(elimination, times, data, sampler="map", samples=4, trajectory_draws=0, progress=False)
-    ahead = predictions(lfm.forecast(result, elimination, at, progress=False))
-    np.testing.assert_allclose(ahead["states"].sel(time=72.0), 0.0, atol=1e-2)
+    forecast = predictions(lfm.forecast(result, elimination, requested_times, progress=False))
+    np.testing.assert_allclose(forecast["states"].sel(time=72.0), 0.0, atol=1e-2)
 
 
 @pytest.mark.slow
@@ -387,5 +390,5 @@ def test_a_stiff_fit_has_a_stiff_forecast():
     times = np.array([2.0, 4.0, 6.0])
     result = lfm.fit(elimination, times, np.zeros((3, 1)), sampler="map", samples=4, trajectory_draws=0, progress=False,
                      model_kwargs=options)
-    ahead = predictions(lfm.forecast(result, elimination, [8.0, 200.0], progress=False, model_kwargs=options))
-    np.testing.assert_allclose(ahead["states"], 0.0, atol=1e-8)
+    forecast = predictions(lfm.forecast(result, elimination, [8.0, 200.0], progress=False, model_kwargs=options))
+    np.testing.assert_allclose(forecast["states"], 0.0, atol=1e-8)

@@ -79,9 +79,9 @@ def test_a_selected_series_is_smoothed_as_if_alone(result, series):
 @pytest.mark.thorough
 @pytest.mark.parametrize("times", [[6.0, 7.0], [[1.5, 7.0], [3.5, 9.0]]])
 def test_a_forecast_is_that_of_each_series(result, times):
-    ahead = lfm.forecast(result, model, times, progress=False)
+    forecast = lfm.forecast(result, model, times, progress=False)
     for series, requested in enumerate(np.broadcast_to(times, (2, 2))):
-        predicted = ResultView.of(lfm.select_series(ahead, series)).group("predictions")
+        predicted = ResultView.of(lfm.select_series(forecast, series)).group("predictions")
         assert predicted["y"].dims == ("chain", "draw", "time", "output")
         np.testing.assert_array_equal(predicted["time"], requested)
         expected = smoothed(series, requested)
@@ -93,14 +93,14 @@ def test_a_forecast_is_that_of_each_series(result, times):
 @pytest.mark.thorough
 @pytest.mark.parametrize("times", [[6.0, 7.0], [1.5, 3.5, 9.0]])
 def test_a_forecast_of_a_selected_series_is_that_of_the_panel(result, times, tmp_path):
-    ahead = lfm.forecast(result, model, times, progress=False)
+    forecast = lfm.forecast(result, model, times, progress=False)
     for series in ("Bo", 0):
         view = lfm.select_series(result, series)
         lfm.save(view, tmp_path / f"{series}.nc")
         for stored in (view, lfm.load(tmp_path / f"{series}.nc")):
             alone = lfm.forecast(stored, model, times, progress=False)
             predicted, expected = (ResultView.of(part).group("predictions")
-                                   for part in (alone, lfm.select_series(ahead, series)))
+                                   for part in (alone, lfm.select_series(forecast, series)))
             xr.testing.assert_allclose(predicted, expected)
             assert predicted.attrs == expected.attrs
         assert set(ResultView.of(alone).groups) == {*ResultView.of(view).groups, "predictions"}
@@ -148,10 +148,11 @@ def test_figures_have_axes_for_each_series(result):
 
 @pytest.mark.thorough
 def test_the_report_shows_the_series(result, tmp_path):
-    ahead = lfm.forecast(result, model, [[1.5, 7.0], [3.5, 9.0]], progress=False)
-    page = lfm.save_report(ahead, tmp_path).read_text()
+    forecast = lfm.forecast(result, model, [[1.5, 7.0], [3.5, 9.0]], progress=False)
+    page = lfm.save_report(forecast, tmp_path).read_text()
     assert "patient Ann" in page and "could not be drawn" not in page
-    assert "could not be drawn" not in lfm.save_report(lfm.select_series(ahead, "Bo"), tmp_path / "b.html").read_text()
+    page = lfm.save_report(lfm.select_series(forecast, "Bo"), tmp_path / "b.html").read_text()
+    assert "could not be drawn" not in page
 
 
 def test_wrong_times_and_series_are_refused(result):

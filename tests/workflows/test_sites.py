@@ -31,7 +31,7 @@ def likelihood(name, rate, times, heat=None):
     return lfm.MarginalLikelihood(system, times)
 
 
-def both(times, y):
+def joint_model(times, y):
     rate = numpyro.sample("rate", dist.LogNormal(-1.0, 0.5))
     for name in ("a", "b"):
         numpyro.sample(name, likelihood(name, rate, times[name]), obs=y[name])
@@ -58,7 +58,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fitted(folder):
-    return lfm.fit(both, DATA, checkpoint=folder, overwrite=True, **SETTINGS)
+    return lfm.fit(joint_model, DATA, checkpoint=folder, overwrite=True, **SETTINGS)
 
 
 def posterior_mean():
@@ -75,7 +75,7 @@ def posterior_mean():
 @pytest.mark.thorough
 @pytest.mark.parametrize("sampler", [pytest.param("ram", marks=pytest.mark.thorough), "nuts"])
 def test_samplers_have_the_posterior_of_the_product(sampler):
-    result = lfm.fit(both, DATA, sampler=sampler, chains=2, warmup=150, samples=500, trajectory_draws=0,
+    result = lfm.fit(joint_model, DATA, sampler=sampler, chains=2, warmup=150, samples=500, trajectory_draws=0,
                      chain_method="vectorized", progress=False)
     mean, sd = posterior_mean()
     table = arviz_data.summary(result)
@@ -85,7 +85,7 @@ def test_samplers_have_the_posterior_of_the_product(sampler):
 
 def test_a_sampler_of_one_site_says_so():
     with pytest.raises(ValueError, match=r"'pmmh'.*a, b"):
-        lfm.fit(both, DATA, sampler="pmmh", progress=False)
+        lfm.fit(joint_model, DATA, sampler="pmmh", progress=False)
 
 
 @pytest.mark.thorough
@@ -128,13 +128,13 @@ def test_a_selected_site_is_a_result_of_one_site(fitted, tmp_path):
 
 @pytest.mark.thorough
 def test_forecast_and_score_by_site(fitted):
-    ahead = lfm.forecast(fitted, both, {"a": [6.0, 7.0]}, progress=False)
-    assert ResultView.of(ahead).group("predictions_a")["a"].shape == (1, 40, 2, 1)
+    forecast = lfm.forecast(fitted, joint_model, {"a": [6.0, 7.0]}, progress=False)
+    assert ResultView.of(forecast).group("predictions_a")["a"].shape == (1, 40, 2, 1)
     expected = np.exp(-0.4 * np.array([[6.0], [7.0]]))
-    table = lfm.score(lfm.select_series(ahead, "a"), expected)
+    table = lfm.score(lfm.select_series(forecast, "a"), expected)
     assert table.index.tolist() == ["level", "all"] and table.loc["all", "rmse"] < 0.3
     with pytest.raises(ValueError, match="'c'"):
-        lfm.forecast(fitted, both, {"c": [6.0]}, progress=False)
+        lfm.forecast(fitted, joint_model, {"c": [6.0]}, progress=False)
 
 
 @pytest.mark.thorough
@@ -142,9 +142,9 @@ def test_a_forecast_of_a_selected_site_is_that_of_all_sites(fitted, tmp_path):
     for name, times in (("a", [6.0, 7.0]), ("b", [2.2, 5.0])):
         site = lfm.select_series(fitted, name)
         lfm.save(site, tmp_path / f"{name}.nc")
-        alone = lfm.forecast(lfm.load(tmp_path / f"{name}.nc"), both, times, progress=False)
-        expected = lfm.select_series(lfm.forecast(fitted, both, {name: times}, progress=False), name)
-        xr.testing.assert_allclose(*(ResultView.of(ahead).group("predictions") for ahead in (alone, expected)))
+        alone = lfm.forecast(lfm.load(tmp_path / f"{name}.nc"), joint_model, times, progress=False)
+        expected = lfm.select_series(lfm.forecast(fitted, joint_model, {name: times}, progress=False), name)
+        xr.testing.assert_allclose(*(ResultView.of(forecast).group("predictions") for forecast in (alone, expected)))
         assert lfm.score(alone, np.zeros((2, len(GAIN[name])))).loc["all", "n"] == 2 * len(GAIN[name])
 
 
@@ -152,7 +152,8 @@ def test_a_forecast_of_a_selected_site_is_that_of_all_sites(fitted, tmp_path):
 def test_paths_of_a_site_are_those_of_its_model_alone():
     times = {"a": np.arange(2.0, 6.0), "b": np.arange(5.0)}
     y = {"a": Y["a"][:4], "b": np.append(np.exp(-0.4 * times["b"][:-1]), np.nan)[:, None]}
-    at = np.array([0.5, 3.5, 4.0, 6.0])  # before the first time of the other site, and after the last observation
+    # Before the first time of the other site, and after the last observation.
+    requested_times = np.array([0.5, 3.5, 4.0, 6.0])
 
     def two(times, y):
         rate = numpyro.sample("rate", dist.LogNormal(-1.0, 0.5))
@@ -163,7 +164,7 @@ def test_paths_of_a_site_are_those_of_its_model_alone():
         numpyro.sample("y", cubic(numpyro.sample("rate", dist.LogNormal(-1.0, 0.5)), times), obs=y)
 
     paths, expected = (
-        trajectories(jax.random.key(1), bound, {"rate": np.array([0.3, 0.5])}, at)
+        trajectories(jax.random.key(1), bound, {"rate": np.array([0.3, 0.5])}, requested_times)
         for bound in (lfm.bind(two, times, y).site_models["b"], lfm.bind(alone, times["b"], y["b"])))
     assert paths["state"].shape == (2, 4, 1)
     for name in ("state", "force", "output", "prediction", "log_likelihood"):
@@ -172,7 +173,7 @@ def test_paths_of_a_site_are_those_of_its_model_alone():
 
 @pytest.mark.thorough
 def test_the_check_adds_the_sites(fitted):
-    report = lfm.check_accuracy(fitted, both, draws=10, particles=500, replicates=2, reference="particles",
+    report = lfm.check_accuracy(fitted, joint_model, draws=10, particles=500, replicates=2, reference="particles",
                                 progress=False)
     rates = ResultView.of(fitted).posterior["rate"].sel(draw=report.dataset["draw"]).values.ravel()
     expected = [sum(likelihood(name, rate, TIMES[name]).log_prob(Y[name]) for name in Y) for rate in rates]
@@ -197,8 +198,8 @@ def test_report_and_figures_of_a_site(fitted, tmp_path):
 def test_dates_of_all_sites_count_from_one_midnight():
     days = {name: pd.date_range(first, periods=len(Y[name]), freq="D")
             for name, first in (("a", "2026-01-02"), ("b", "2026-01-01"))}
-    result = lfm.fit(both, {name: (days[name], Y[name]) for name in Y}, sampler="map", samples=2, trajectory_draws=0,
-                     progress=False)
+    result = lfm.fit(joint_model, {name: (days[name], Y[name]) for name in Y}, sampler="map", samples=2,
+                     trajectory_draws=0, progress=False)
     observed = ResultView.of(result).group("observed_data")
     assert observed["a_time"].values[0] == 1.0 and observed["b_time"].values[0] == 0.0
     assert ResultView.of(result).attrs["time_origin"].startswith("2026-01-01")
@@ -216,17 +217,17 @@ def test_known_inputs_reach_their_site():
     data = {"a": lfm.Data(TIMES["a"], Y["a"], ("level",), inputs={"heat": heat}), "b": DATA["b"]}
     result = lfm.fit(heated, data, sampler="map", samples=2, trajectory_draws=0, progress=False)
     rate = float(ResultView.of(result).posterior["rate"][0, 0])
-    for name, known in (("a", lfm.Input(*heat)), ("b", None)):
+    for name, known_input in (("a", lfm.Input(*heat)), ("b", None)):
         terms = ResultView.of(result).group(f"one_step_ahead_{name}")["log_density"][0, 0]
         assert float(terms.sum()) == pytest.approx(
-            float(likelihood(name, rate, TIMES[name], known).log_prob(Y[name])), abs=1e-9)
+            float(likelihood(name, rate, TIMES[name], known_input).log_prob(Y[name])), abs=1e-9)
     longer = lfm.Input(np.array([0.0, 2.0, 7.0]), np.array([0.5, 0.0, 1.0]))
-    ahead = lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"a": {"heat": longer}}, progress=False)
-    assert {"predictions_a", "predictions_constant_data_a"} <= set(ResultView.of(ahead).groups)
+    forecast = lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"a": {"heat": longer}}, progress=False)
+    assert {"predictions_a", "predictions_constant_data_a"} <= set(ResultView.of(forecast).groups)
     alone = lfm.forecast(lfm.select_series(result, "a"), heated, [6.0, 7.0], inputs={"heat": longer}, progress=False)
     assert "predictions_constant_data" in ResultView.of(alone).groups
     xr.testing.assert_allclose(*(ResultView.of(view).group("predictions")["y"]
-                                 for view in (alone, lfm.select_series(ahead, "a"))))
+                                 for view in (alone, lfm.select_series(forecast, "a"))))
     with pytest.raises(ValueError, match="inputs: unknown likelihood site 'heat'.*a, b"):
         lfm.forecast(result, heated, {"a": [6.0, 7.0]}, inputs={"heat": longer}, progress=False)
 
@@ -240,22 +241,22 @@ def test_data_by_site_are_told_from_columns():
                     frame.set_index("time").to_xarray()):
         assert data_by_site(columns, None) is None
     with pytest.raises(TypeError, match="site 'b'.*got ndarray"):
-        lfm.fit(both, {"a": DATA["a"], "b": Y["b"]}, progress=False)
+        lfm.fit(joint_model, {"a": DATA["a"], "b": Y["b"]}, progress=False)
 
 
 @pytest.mark.thorough
 def test_a_finished_fit_is_read_again(fitted, folder):
-    again = lfm.fit(both, DATA, checkpoint=folder, resume=True, **SETTINGS)
-    np.testing.assert_array_equal(ResultView.of(again).posterior["rate"],
+    resumed = lfm.fit(joint_model, DATA, checkpoint=folder, resume=True, **SETTINGS)
+    np.testing.assert_array_equal(ResultView.of(resumed).posterior["rate"],
                                   ResultView.of(fitted).posterior["rate"])
-    other = {**DATA, "b": (TIMES["b"], 2 * Y["b"])}
+    other_data = {**DATA, "b": (TIMES["b"], 2 * Y["b"])}
     with pytest.raises(ValueError, match="data"):
-        lfm.fit(both, other, checkpoint=folder, resume=True, **SETTINGS)
+        lfm.fit(joint_model, other_data, checkpoint=folder, resume=True, **SETTINGS)
 
 
 @pytest.mark.thorough
 def test_draws_of_numpyro(fitted):
     draws = {"rate": ResultView.of(fitted).posterior["rate"].values}
-    result = lfm.to_arviz(draws, both, TIMES, Y, trajectory_draws=0)
+    result = lfm.to_arviz(draws, joint_model, TIMES, Y, trajectory_draws=0)
     np.testing.assert_allclose(ResultView.of(result).group("log_likelihood")["b"],
                                ResultView.of(fitted).group("log_likelihood")["b"], atol=1e-10)

@@ -95,16 +95,16 @@ def test_derived_parameters_and_warnings_are_marked_in_a_file_too(converted, tmp
     posterior = group(converted, "posterior")
     assert posterior["half_life"].attrs["derived"] == 1
     assert "derived" not in posterior["decay"].attrs
-    said = json.loads(ResultView.of(converted).attrs["warnings"])
-    assert said
+    stored_warnings = json.loads(ResultView.of(converted).attrs["warnings"])
+    assert stored_warnings
     table = tables.annotate(arviz_data.summary(converted), converted)
     assert table.loc["half_life[p21]", "kind"] == "derived"
     assert table.loc["noise_sd", "kind"] == "sampled"
     assert table.loc["noise_sd", "warnings"]
-    again = lfm.load(lfm.save(converted, tmp_path / "posterior.nc"))
-    assert ResultView.of(again).attrs["warnings"] == ResultView.of(converted).attrs["warnings"]
-    assert group(again, "posterior")["half_life"].attrs["derived"] == 1
-    assert group(again, "posterior")["gene"].values.tolist() == ["p21", "sestrin"]
+    loaded = lfm.load(lfm.save(converted, tmp_path / "posterior.nc"))
+    assert ResultView.of(loaded).attrs["warnings"] == ResultView.of(converted).attrs["warnings"]
+    assert group(loaded, "posterior")["half_life"].attrs["derived"] == 1
+    assert group(loaded, "posterior")["gene"].values.tolist() == ["p21", "sestrin"]
 
 
 def test_draws_without_an_mcmc_and_without_derived_ones(mcmc, converted):
@@ -119,7 +119,10 @@ def test_draws_without_an_mcmc_and_without_derived_ones(mcmc, converted):
 def panel_model(times, y=None):
     with numpyro.plate("patient", 3):
         decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
-        build = lambda p: motif.build(p["decay"][None], 1.5, 0.2)  # noqa: E731
+
+        def build(p):
+            return motif.build(p["decay"][None], 1.5, 0.2)
+
         numpyro.sample("y", lfm.panel(build, {"decay": decay}, times), obs=y)
 
 
