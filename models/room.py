@@ -65,7 +65,7 @@ def model(times, y=None, inputs=None, units=None) -> None:
     Args:
         times: hours, shape (T,).
         y: temperatures, shape (T, 1); NaN is missing, None draws from the prior predictive.
-        inputs: ``{"heater": function of time, "outside": function of time}``; None: those of the default data.
+        inputs: ``{"heater": function of time, "outside": function of time}``; None: the inputs of the default data.
         units: name -> unit, for plots.
     """
     loss = numpyro.sample("loss", dist.LogNormal(jnp.log(0.2), 0.5))

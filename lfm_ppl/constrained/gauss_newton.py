@@ -53,7 +53,7 @@ from lfm_ppl.constrained.interior_point import (
     weighted_noise,
 )
 from lfm_ppl.filtering.backward import SmootherTrace, backward
-from lfm_ppl.filtering.forward import FilterTrace, IntervalMaps, LinearizationPoints, forward
+from lfm_ppl.filtering.forward import FilterTrace, IntervalMaps, LinearisationPoints, forward
 from lfm_ppl.filtering.intervals import as_arrays
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.predict import predict
@@ -288,7 +288,7 @@ def _gauss_newton_pass(problem: ConstrainedProblem, trajectory: Trajectory, maps
                     (1.0 - weight) * problem.start.covariance)
     nodes = Moments(trajectory.nodes[1:], jnp.zeros_like(maps.process_cov))
     passes = filter_problem(ssm, Taylor(), problem.grid)
-    forward_pass = forward(passes, GaussianUpdate(y), initial=prior, about=LinearizationPoints(nodes, nodes),
+    forward_pass = forward(passes, GaussianUpdate(y), initial=prior, about=LinearisationPoints(nodes, nodes),
                            record=Record.SMOOTHER, maps=maps)
     smoothed = backward(passes, forward_pass)
     noise = problem.at_grid(weighted_noise(forward_pass, smoothed))[:, problem.outputs:]

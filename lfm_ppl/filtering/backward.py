@@ -80,7 +80,7 @@ def backward(problem: FilterProblem, trace: FilterTrace, adjoint_only: bool = Fa
 
     Args:
         problem: the problem of the forward pass.
-        trace: the forward pass, recorded for the smoother, or for a linearization if only the adjoint is asked for.
+        trace: the forward pass, recorded for the smoother, or for a linearisation if only the adjoint is asked for.
         adjoint_only: leave out the smoothed moments and the leave-one-out terms, which then are the filtered moments
             and zero.
     """

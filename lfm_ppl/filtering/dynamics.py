@@ -41,7 +41,7 @@ class Dynamics(NamedTuple):
     linear: LinearPart
 
 
-class DriftLinearization(NamedTuple):
+class DriftLinearisation(NamedTuple):
     """Linearised dynamics at a Runge-Kutta node, the constant linear part removed.
 
     Attributes:
@@ -87,7 +87,7 @@ def minimum_sd(dynamics: Dynamics, factor: IntegratingFactor, t: jax.Array, h: j
     return checkpoint_name(jax.lax.stop_gradient(1e-6 * scale + 1e-150), MINIMUM_SD)
 
 
-def linearize(ssm: StateSpaceModel, rule: Rule, function: Function, structure: InputStructure, jacobian: jax.Array,
+def linearise(ssm: StateSpaceModel, rule: Rule, function: Function, structure: InputStructure, jacobian: jax.Array,
               t: jax.Array, about: tuple[jax.Array, Congruence], min_sd: jax.Array) -> AffineMap:
     """Linearise a function of w = K s + k about a Gaussian in s; the Jacobian of the result is (D, n).
 
@@ -127,8 +127,8 @@ def covariance_of(moments: Moments) -> Congruence:
     return lambda rows, reads_forces_only: congruence(rows, moments.covariance)
 
 
-def linearize_drift(dynamics: Dynamics, t: jax.Array, mean: jax.Array, covariance: Congruence, min_sd: jax.Array,
-                    about: Moments | None = None) -> DriftLinearization:
+def linearise_drift(dynamics: Dynamics, t: jax.Array, mean: jax.Array, covariance: Congruence, min_sd: jax.Array,
+                    about: Moments | None = None) -> DriftLinearisation:
     """Linearise the dynamics at a node.
 
     Args:
@@ -146,16 +146,16 @@ def linearize_drift(dynamics: Dynamics, t: jax.Array, mean: jax.Array, covarianc
         return ssm.drift(w, t), () if dispersion is None else outer_square(dispersion)
 
     point = (mean, covariance) if about is None else (about.mean, covariance_of(about))
-    affine = linearize(ssm, rule, function, ssm.drift_structure, linear.jacobian, t, point, min_sd)
+    affine = linearise(ssm, rule, function, ssm.drift_structure, linear.jacobian, t, point, min_sd)
     drift = affine.value
     if about is not None:
         drift = drift + matvec(affine.jacobian, mean - about.mean)
     remainder = drift - matvec(linear.rows, mean)
-    return DriftLinearization(remainder, affine.jacobian - linear.rows,
+    return DriftLinearisation(remainder, affine.jacobian - linear.rows,
                               affine.extra if isinstance(affine.extra, jax.Array) else None)
 
 
-def linearization_indices(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:
+def linearisation_indices(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:
     """Return the indices (k,) of the joint states whose moments a linearisation of the dynamics needs."""
     if isinstance(rule, SigmaPointRule) and rule.full_state:
         return np.arange(ssm.state_dim)
@@ -168,7 +168,7 @@ def linearization_indices(ssm: StateSpaceModel, rule: Rule) -> np.ndarray:
 
 def embed_in_state(ssm: StateSpaceModel, rule: Rule, moments: Moments) -> Moments:
     """Return moments (..., n), (..., n, n) of the joint state from the linearised states; others are zero."""
-    indices = linearization_indices(ssm, rule)
+    indices = linearisation_indices(ssm, rule)
     if is_contiguous(indices):
         first = int(indices[0]) if indices.size else 0
         width = first, ssm.state_dim - first - indices.size

@@ -33,18 +33,18 @@ from lfm_ppl.filtering.update import (
     RowUpdate,
     Update,
     Updater,
-    linearize_observation,
+    linearise_observation,
 )
 
 _STORED = jax.checkpoint_policies.save_only_these_names(MINIMUM_SD, UPDATE_FAILED, INNOVATION_FACTOR)
 """What reverse mode stores of an interval besides its inputs."""
 
 
-class LinearizationPoints(NamedTuple):
+class LinearisationPoints(NamedTuple):
     """Moments about which a pass is linearised.
 
     Attributes:
-        nodes: (N, J + 1, k), (N, J + 1, k, k) of the linearised states (`linearization_indices`) at the ends of the
+        nodes: (N, J + 1, k), (N, J + 1, k, k) of the linearised states (`linearisation_indices`) at the ends of the
             steps of each interval, before a jump.
         end_moments: (N, n), (N, n, n) at the intervals' ends, after a jump; None unless the observation is non-linear.
     """
@@ -93,7 +93,7 @@ class FilterTrace(NamedTuple):
 
 
 def forward(problem: FilterProblem, updater: Updater, *, initial: Moments | None = None,
-            about: LinearizationPoints | None = None, record: Record = Record.LIKELIHOOD,
+            about: LinearisationPoints | None = None, record: Record = Record.LIKELIHOOD,
             maps: IntervalMaps | None = None) -> FilterTrace:
     """Run the forward scan.
 
@@ -150,7 +150,7 @@ def update_at_end(problem: FilterProblem, update: RowUpdate, interval: Intervals
         centre: moments about which the observation is linearised; None: the predicted ones.
     """
     index = jnp.maximum(interval.observation, 0)
-    observation = linearize_observation(problem.ssm, problem.rule, problem.shared.observation_jacobian, interval.end,
+    observation = linearise_observation(problem.ssm, problem.rule, problem.shared.observation_jacobian, interval.end,
                                         index, predicted if centre is None else centre)
     if centre is not None:
         observation = observation.shifted(predicted.mean - centre.mean)
@@ -164,7 +164,7 @@ def _recorded_update(update: Update, record: Record) -> Update:
     return update
 
 
-def maps_about(problem: FilterProblem, points: LinearizationPoints | None) -> IntervalMaps | None:
+def maps_about(problem: FilterProblem, points: LinearisationPoints | None) -> IntervalMaps | None:
     """Return the affine maps of all intervals of a model that is linearised about given points.
 
     They are None for a time-invariant model or adaptive steps, whose passes compute them at no cost or need the moments

@@ -33,8 +33,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.filtering.backward import SmootherTrace, at_interval_starts, backward
-from lfm_ppl.filtering.dynamics import columns, linearization_indices
-from lfm_ppl.filtering.forward import FilterTrace, LinearizationPoints, forward
+from lfm_ppl.filtering.dynamics import columns, linearisation_indices
+from lfm_ppl.filtering.forward import FilterTrace, LinearisationPoints, forward
 from lfm_ppl.filtering.intervals import TimeGrid
 from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.predict import NodeRecord
@@ -66,7 +66,7 @@ class Anchor(NamedTuple):
 
     since: jax.Array
     length: jax.Array
-    points: LinearizationPoints
+    points: LinearisationPoints
     variance_share: jax.Array | None
 
     def on_grid(self, grid: TimeGrid, is_own: bool = False) -> Anchor:
@@ -97,7 +97,7 @@ class Anchor(NamedTuple):
 
         nodes, share = jax.tree.map(interpolate, (self.points.nodes, self.variance_share))
         end_moments = jax.tree.map(lambda a: a[row], self.points.end_moments)
-        return Anchor(since, length, LinearizationPoints(nodes, end_moments), share)
+        return Anchor(since, length, LinearisationPoints(nodes, end_moments), share)
 
 
 class IterationResult(NamedTuple):
@@ -110,7 +110,7 @@ class IterationResult(NamedTuple):
             two.
     """
 
-    points: LinearizationPoints | None
+    points: LinearisationPoints | None
     change: jax.Array
     log_likelihood: jax.Array
 
@@ -143,10 +143,10 @@ class _State(NamedTuple):
     log_likelihood: jax.Array
 
     @property
-    def points(self) -> LinearizationPoints:
+    def points(self) -> LinearisationPoints:
         """The moments of the iterates."""
         nodes, end_moments = self.iterates
-        return LinearizationPoints(nodes.moments, None if end_moments is None else end_moments.moments)
+        return LinearisationPoints(nodes.moments, None if end_moments is None else end_moments.moments)
 
     @property
     def change(self) -> jax.Array:
@@ -227,7 +227,7 @@ def converged_anchor(problem: FilterProblem, updater: Updater, damping: float, a
 
 
 def _check_states(problem: FilterProblem, anchor: Anchor) -> None:
-    expected = len(linearization_indices(problem.ssm, problem.rule))
+    expected = len(linearisation_indices(problem.ssm, problem.rule))
     if (count := np.shape(anchor.points.nodes.mean)[-1]) != expected:
         raise ValueError(f"about has moments of {count} states, and this model with this rule is linearised about "
                          f"{expected}; take the anchor of a likelihood of the same model and rule.")
@@ -274,7 +274,7 @@ def _iterate(problem: FilterProblem, updater: Updater, damping: float, state: _S
     return _State((nodes, end_moments), trace.log_likelihood.sum())
 
 
-def _smoothed(problem: FilterProblem, trace: FilterTrace) -> LinearizationPoints:
+def _smoothed(problem: FilterProblem, trace: FilterTrace) -> LinearisationPoints:
     return smoothed_points(problem, trace, backward(problem, trace, adjoint_only=True))
 
 
@@ -285,7 +285,7 @@ def predicted_variance(problem: FilterProblem, single_pass: FilterTrace) -> jax.
     """
     if single_pass.nodes is None:
         return None
-    indices = linearization_indices(problem.ssm, problem.rule)
+    indices = linearisation_indices(problem.ssm, problem.rule)
 
     def variance(covariance: jax.Array) -> jax.Array:
         return jnp.diagonal(covariance, axis1=-2, axis2=-1)
@@ -324,7 +324,7 @@ def _damped_update(old: _Iterate, smoothed: Moments, damping: float) -> _Iterate
     return _Iterate(moments, step, fraction, change)
 
 
-def smoothed_points(problem: FilterProblem, trace: FilterTrace, smoothed: SmootherTrace) -> LinearizationPoints:
+def smoothed_points(problem: FilterProblem, trace: FilterTrace, smoothed: SmootherTrace) -> LinearisationPoints:
     """Return the smoothed moments about which the next pass is linearised.
 
     With the adjoint (r, Lambda) at the end of the interval in which a node lies they are
@@ -337,7 +337,7 @@ def smoothed_points(problem: FilterProblem, trace: FilterTrace, smoothed: Smooth
         smoothed: its backward scan, at least the adjoint.
     """
     ssm, grid = problem.ssm, problem.grid
-    indices = linearization_indices(ssm, problem.rule)
+    indices = linearisation_indices(ssm, problem.rule)
     r, adjoint = smoothed.adjoint
     has_jumps = problem.has_jumps
 
@@ -369,4 +369,4 @@ def smoothed_points(problem: FilterProblem, trace: FilterTrace, smoothed: Smooth
         starts = jnp.concatenate([first[None], after_jump[:-1]])
         return jnp.concatenate([starts[:, None], inner], axis=1)
 
-    return LinearizationPoints(jax.tree.map(join, first, after_jump, inner), end_moments)
+    return LinearisationPoints(jax.tree.map(join, first, after_jump, inner), end_moments)

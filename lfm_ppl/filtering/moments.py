@@ -45,13 +45,13 @@ class Record(enum.Enum):
     SMOOTHER       yes            yes                       yes                                   yes
     ============== ============== ========================= ================= =================== ==============
 
-    LINEARIZATION is for the backward scan of the smoother's adjoint and the next linearization points of iterated
+    LINEARIZATION is for the backward scan of the smoother's adjoint and the next linearisation points of iterated
     posterior linearisation, SMOOTHER for smoothed moments and trajectories.
     """
 
     LIKELIHOOD = "likelihood"
     MOMENTS = "moments"
-    LINEARIZATION = "linearization"
+    LINEARIZATION = "linearisation"
     SMOOTHER = "smoother"
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl.filtering.dynamics import columns, linearization_indices
+from lfm_ppl.filtering.dynamics import columns, linearisation_indices
 from lfm_ppl.filtering.integrators.integrator import Section, Stepping, StepRecord, identity_prediction
 from lfm_ppl.filtering.intervals import Intervals
 from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose, matvec, transform
@@ -89,7 +89,7 @@ def _collect_nodes(problem: FilterProblem, interval: Intervals, prediction: Pred
         return matmul(to_end, phi), matmul(covariance, to_end.T)
 
     phi, cross = jax.lax.scan(previous_step, to_end, (steps.covariance, steps.phi), reverse=True)
-    covariance = columns(steps.covariance, linearization_indices(ssm, problem.rule))
+    covariance = columns(steps.covariance, linearisation_indices(ssm, problem.rule))
     return prediction._replace(phi=phi, nodes=NodeRecord(Moments(steps.mean, covariance), cross))
 
 

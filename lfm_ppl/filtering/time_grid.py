@@ -116,7 +116,7 @@ _refuses_traced_times: ContextVar[bool] = ContextVar("_refuses_traced_times", de
 
 @contextlib.contextmanager
 def refuse_traced_times() -> Iterator[None]:
-    """Raise ValueError for a grid of traced times within the context: its steps may differ from those of the values."""
+    """Raise ValueError for a grid of traced times within the context: it may have other steps than the values have."""
     token = _refuses_traced_times.set(True)
     try:
         yield

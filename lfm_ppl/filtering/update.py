@@ -1,6 +1,6 @@
 """Updates: condition the predicted moments on one observation, or multiply them with Gaussian factors.
 
-1. `linearize_observation` gives the observation as an affine map of the state.
+1. `linearise_observation` gives the observation as an affine map of the state.
 2. An `Updater` turns that map, the row's data and the predicted moments into an `Update`: `GaussianUpdate` conditions
    on a Gaussian observation, `FactorUpdate` multiplies with given factors, and `MomentMatchingUpdate` of
    `lfm_ppl.filtering.ep.moment_matching` computes the factors of a row from its prediction.
@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
-from lfm_ppl.filtering.dynamics import covariance_of, linearize
+from lfm_ppl.filtering.dynamics import covariance_of, linearise
 from lfm_ppl.filtering.moments import Moments, matvec
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.linearisation.sigma_points import SigmaPointRule
@@ -49,7 +49,7 @@ _HARMLESS = 1e-6
 """The same errors as fractions of an output's scale (and of its square) that do no harm, however small the noise."""
 
 
-class LinearizedObservation(NamedTuple):
+class LinearisedObservation(NamedTuple):
     """An observation as an affine map of the state: y ~ value + jacobian (s - point) + N(0, obs_cov).
 
     ``obs_cov`` is the covariance of the linearisation's residual and, for a Gaussian observation, of its noise. For an
@@ -60,7 +60,7 @@ class LinearizedObservation(NamedTuple):
     jacobian: jax.Array
     obs_cov: jax.Array
 
-    def shifted(self, change: jax.Array) -> LinearizedObservation:
+    def shifted(self, change: jax.Array) -> LinearisedObservation:
         """Return the same map with its point moved by ``change`` (n,)."""
         return self._replace(value=self.value + matvec(self.jacobian, change))
 
@@ -132,7 +132,7 @@ class Update(NamedTuple):
     factor_terms: FactorTerms | None = None
 
 
-RowUpdate = Callable[[LinearizedObservation, jax.Array, Any, Moments], Update]
+RowUpdate = Callable[[LinearisedObservation, jax.Array, Any, Moments], Update]
 """Maps a linearised observation, the row's index, its data and the predicted moments to an `Update`.
 
 The index is for parameters of a row, such as its covariance; it is 0 in an interval without an observation.
@@ -174,7 +174,7 @@ class GaussianUpdate(NamedTuple):
         """Return the update of one row; the scale of the outputs is that of all data and of the prior."""
         scale = _output_scale(problem, self.rows(), initial)
 
-        def update(observation: LinearizedObservation, index: jax.Array, y: jax.Array, predicted: Moments) -> Update:
+        def update(observation: LinearisedObservation, index: jax.Array, y: jax.Array, predicted: Moments) -> Update:
             return condition(problem.ssm, observation, y, predicted, scale)
 
         return update
@@ -196,14 +196,14 @@ class FactorUpdate(NamedTuple):
     def bind(self, problem: FilterProblem, initial: Moments) -> RowUpdate:
         """Return the update of one row."""
 
-        def update(observation: LinearizedObservation, index: jax.Array, row: jax.Array, predicted: Moments) -> Update:
+        def update(observation: LinearisedObservation, index: jax.Array, row: jax.Array, predicted: Moments) -> Update:
             return multiply_by_factors(observation, Factors(*jnp.where(jnp.isnan(row), 0.0, row)), predicted)
 
         return update
 
 
-def linearize_observation(ssm: StateSpaceModel, rule: Rule, jacobian: jax.Array, t: jax.Array, row: jax.Array,
-                          centre: Moments) -> LinearizedObservation:
+def linearise_observation(ssm: StateSpaceModel, rule: Rule, jacobian: jax.Array, t: jax.Array, row: jax.Array,
+                          centre: Moments) -> LinearisedObservation:
     """Linearise the observation of a row at time t about given moments."""
     angular, period = ssm.model.observation.angular, ssm.model.observation.period
     if angular:
@@ -216,9 +216,9 @@ def linearize_observation(ssm: StateSpaceModel, rule: Rule, jacobian: jax.Array,
             value = value.at[index].set(middle[index] + wrapped(value[index] - middle[index], period))
         return value, ssm.obs_cov(w, t, row)
 
-    affine = linearize(ssm, rule, function, ssm.observation_structure, jacobian, t,
+    affine = linearise(ssm, rule, function, ssm.observation_structure, jacobian, t,
                        (centre.mean, covariance_of(centre)), _minimum_sd(ssm, rule, t, centre))
-    return LinearizedObservation(affine.value, affine.jacobian, affine.residual_cov + affine.extra)
+    return LinearisedObservation(affine.value, affine.jacobian, affine.residual_cov + affine.extra)
 
 
 def _minimum_sd(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments) -> jax.Array:
@@ -231,7 +231,7 @@ def _minimum_sd(ssm: StateSpaceModel, rule: Rule, t: jax.Array, moments: Moments
     return jax.lax.stop_gradient(1e-6 * jnp.where(scale == 0, 1e-3, jnp.abs(scale)))
 
 
-def condition(ssm: StateSpaceModel, observation: LinearizedObservation, y: jax.Array, predicted: Moments,
+def condition(ssm: StateSpaceModel, observation: LinearisedObservation, y: jax.Array, predicted: Moments,
               scale: jax.Array | None = None) -> Update:
     """Condition on the present entries of ``y``, with the covariance in Joseph's form.
 
@@ -269,7 +269,7 @@ def condition(ssm: StateSpaceModel, observation: LinearizedObservation, y: jax.A
     return Update(filtered, log_likelihood, innovation, gain, jacobian, factor.chol, obs_cov, present)
 
 
-def _output_errors(ssm: StateSpaceModel, observation: LinearizedObservation, y: jax.Array, predicted: Moments,
+def _output_errors(ssm: StateSpaceModel, observation: LinearisedObservation, y: jax.Array, predicted: Moments,
                    filtered: Moments, expected: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the error (D,) of the filtered outputs, whose residual should be ``expected``, and their variance (D,).
 
@@ -304,12 +304,12 @@ def _output_scale(problem: FilterProblem, y: jax.Array, initial: Moments) -> jax
     return jax.lax.stop_gradient(scale)
 
 
-def predictor_variance(observation: LinearizedObservation, moments: Moments) -> jax.Array:
+def predictor_variance(observation: LinearisedObservation, moments: Moments) -> jax.Array:
     """Return the covariance F (D, D) of a family's predictor."""
     return congruence(observation.jacobian, moments.covariance) + observation.obs_cov
 
 
-def multiply_by_factors(observation: LinearizedObservation, factors: Factors, predicted: Moments) -> Update:
+def multiply_by_factors(observation: LinearisedObservation, factors: Factors, predicted: Moments) -> Update:
     r"""Multiply the predicted moments with Gaussian factors in natural parameters.
 
     With f ~ N(m, F) as predicted and d = f - c,

@@ -1,6 +1,6 @@
 """Linearised models, in which `lfm_ppl.model.resolution` and `lfm_ppl.model.truncation` estimate errors of forces.
 
-1. Linearise the model at its prior mean (`linearized_terms`).
+1. Linearise the model at its prior mean (`linearised_terms`).
 2. On a time grid, over each step of which a force is taken as linear in time, compute the response of the outputs to
    the forces by one matrix exponential per distinct step (`output_responses`).
 3. `error_bound` gives the error of the log likelihood from the eigenvalues of the approximate and exact covariances.
@@ -49,7 +49,7 @@ class ForceTerm(NamedTuple):
     force: Force
 
 
-class LinearizedTerm(NamedTuple):
+class LinearisedTerm(NamedTuple):
     """A force of a linearised model, its other forces, and the observed times (N,), N > 1."""
 
     term: ForceTerm
@@ -58,8 +58,8 @@ class LinearizedTerm(NamedTuple):
     times: np.ndarray
 
 
-def linearized_terms(model: LatentForceModel, times: Any, y: Any,
-                     is_checked: Callable[[Force], bool]) -> list[LinearizedTerm]:
+def linearised_terms(model: LatentForceModel, times: Any, y: Any,
+                     is_checked: Callable[[Force], bool]) -> list[LinearisedTerm]:
     """Return the forces that ``is_checked`` selects, also in sums, with the model linearised at its prior mean.
 
     Args:
@@ -77,10 +77,10 @@ def linearized_terms(model: LatentForceModel, times: Any, y: Any,
              for term in (force.forces if isinstance(force, Sum) else (force,))]
     checked = [index for index, term in enumerate(terms) if is_checked(term.force)]
     observed = _observed_times(model, times, y) if checked else None
-    linear = None if observed is None else _linearize(model, observed[0])
+    linear = None if observed is None else _linearise(model, observed[0])
     if observed is None or linear is None:
         return []
-    return [LinearizedTerm(terms[index], terms[:index] + terms[index + 1:], linear, observed) for index in checked]
+    return [LinearisedTerm(terms[index], terms[:index] + terms[index + 1:], linear, observed) for index in checked]
 
 
 def _observed_times(model: LatentForceModel, times: Any, y: Any) -> np.ndarray | None:
@@ -96,7 +96,7 @@ def _observed_times(model: LatentForceModel, times: Any, y: Any) -> np.ndarray |
     return observed if observed.ndim == 1 and observed.size > 1 and np.all(np.isfinite(observed)) else None
 
 
-def _linearize(model: LatentForceModel, time: float) -> LinearModel | None:
+def _linearise(model: LatentForceModel, time: float) -> LinearModel | None:
     """Return the model linearised at its prior mean; None if a coefficient is traced or not finite."""
     t = jnp.asarray(time, float)
     x = model.initial_state.mean

@@ -28,7 +28,7 @@ from lfm_ppl.forces.sde import ApproximationWarning, Force
 from lfm_ppl.forces.squared_exponential import SquaredExponential
 from lfm_ppl.model.even_forces import even_force_message, even_forces
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.linear_response import LEAST_NOISE, TOLERANCE, LinearizedTerm, LinearModel, linearized_terms
+from lfm_ppl.model.linear_response import LEAST_NOISE, TOLERANCE, LinearisedTerm, LinearModel, linearised_terms
 from lfm_ppl.model.truncation import truncation_message, truncations
 
 _SPACINGS = (1e-9, 10.0)
@@ -88,12 +88,12 @@ def resolutions(model: LatentForceModel, times: Any, y: Any = None) -> list[Reso
         y: (T, D), NaN where missing; None: all entries are observed.
 
     Returns:
-        One entry for each squared exponential force, where `linearized_terms` describes the model.
+        One entry for each squared exponential force, where `linearised_terms` describes the model.
     """
     results = []
-    for linearized in linearized_terms(model, times, y, _is_checked):
+    for linearised in linearised_terms(model, times, y, _is_checked):
         with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):
-            results.append(_estimate(linearized))
+            results.append(_estimate(linearised))
     return [result for result in results if np.isfinite(result.error)]
 
 
@@ -101,9 +101,9 @@ def _is_checked(force: Force) -> bool:
     return isinstance(force, SquaredExponential) and np.ndim(force.lengthscale) == np.ndim(force.scale) == 0
 
 
-def _estimate(linearized: LinearizedTerm) -> Resolution:
+def _estimate(linearised: LinearisedTerm) -> Resolution:
     """Return the effect of a force; the error is not finite where numbers overflow."""
-    (name, column, force), other_terms, linear, times = linearized
+    (name, column, force), other_terms, linear, times = linearised
     assert isinstance(force, SquaredExponential)
     lengthscale = float(force.lengthscale)
     spacing = lengthscale * float(np.clip(np.ptp(times) / (times.size - 1) / lengthscale, *_SPACINGS))

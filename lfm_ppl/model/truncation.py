@@ -36,9 +36,9 @@ from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.linear_response import (
     LEAST_NOISE,
     TOLERANCE,
-    LinearizedTerm,
+    LinearisedTerm,
     error_bound,
-    linearized_terms,
+    linearised_terms,
     output_responses,
 )
 
@@ -110,13 +110,13 @@ def truncations(model: LatentForceModel, times: Any, y: Any = None) -> list[Trun
 
     Returns:
         One entry for each `Periodic` or `QuasiPeriodic` force, except those with ``explained_variance=0``, whose
-        functions are the model, where `linearized_terms` describes the model.
+        functions are the model, where `linearised_terms` describes the model.
     """
     results = []
-    for linearized in linearized_terms(model, times, y, _is_checked):
-        initial_time = linearized.times[0] if model.initial_time is None else float(model.initial_time)
+    for linearised in linearised_terms(model, times, y, _is_checked):
+        initial_time = linearised.times[0] if model.initial_time is None else float(model.initial_time)
         with np.errstate(all="ignore"):
-            estimate = _estimate(linearized, initial_time)
+            estimate = _estimate(linearised, initial_time)
         if estimate is not None:
             results.append(estimate)
     return results
@@ -138,12 +138,12 @@ def _is_checked(force: Force) -> bool:
     return isinstance(force, QuasiPeriodic) and force.explained_variance > 0.0 and np.ndim(force.period) == 0
 
 
-def _estimate(linearized: LinearizedTerm, initial_time: float) -> Truncation | None:
+def _estimate(linearised: LinearisedTerm, initial_time: float) -> Truncation | None:
     """Return the effect of a truncation; None if the numbers overflow."""
-    (name, column, force), other_terms, linear, times = linearized
+    (name, column, force), other_terms, linear, times = linearised
     assert isinstance(force, QuasiPeriodic)
     is_direct = not (np.any(linear.c) and np.any(linear.b))
-    if is_direct and (bound := _trace_bound(linearized, initial_time)) <= TOLERANCE:
+    if is_direct and (bound := _trace_bound(linearised, initial_time)) <= TOLERANCE:
         return Truncation(name, force, bound, force.functions)
     rows = _representative_rows(times, force, initial_time, len(linear.c), is_direct)
     if rows is None:
@@ -194,13 +194,13 @@ def _second_order_error(square: float) -> float:
     return 0.25 * square + 2.0 * float(np.sqrt(0.5 * square))
 
 
-def _trace_bound(linearized: LinearizedTerm, initial_time: float) -> float:
+def _trace_bound(linearised: LinearisedTerm, initial_time: float) -> float:
     """Return a bound on the error for a force that is observed directly; infinite if there is no bound.
 
     K is at least the noise covariance, so that sum_i |w_i| is at most the trace of K - K_J relative to the noise. The
     bound takes milliseconds, the estimate about half a second for a thousand rows.
     """
-    (_, column, force), _, linear, times = linearized
+    (_, column, force), _, linear, times = linearised
     assert isinstance(force, QuasiPeriodic)
     if not force.kernel.stationary:
         return np.inf

@@ -176,7 +176,7 @@ def _check_doses(name: str, stored: InputTable, table: InputTable, first: float,
             "none" if np.isnan(amount) else state if state == "a reset" else f"{amount:g} to {state}"
             for amount in amounts)
         raise ValueError(f"the doses {name!r} of the forecast at time {calendar_time.named(time)} are {forecast_dose}, "
-                         f"where those of the fit are {fitted_dose}. Before the last observation, at time "
+                         f"where the fit has {fitted_dose}. Before the last observation, at time "
                          f"{calendar_time.named(last)}, they must be the same: give later doses only, which continue "
                          "the fit's, or fit again.")
 

@@ -34,7 +34,7 @@ from lfm_ppl.filtering.arguments import check_observations, warn_single_precisio
 from lfm_ppl.filtering.filter import FilterState
 from lfm_ppl.filtering.intervals import Intervals, with_observations
 from lfm_ppl.filtering.moments import Moments
-from lfm_ppl.filtering.update import LinearizedObservation, Update, condition
+from lfm_ppl.filtering.update import LinearisedObservation, Update, condition
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.particles.normals import normals
 from lfm_ppl.particles.resampling import RESAMPLING, effective_sample_size, resample, reweight
@@ -240,7 +240,7 @@ def _update(ssm: StateSpaceModel, particles: _Particles, maps: SwitchedMap, y_ro
 
     def update_particle(value: jax.Array, jacobian: jax.Array, obs_cov: jax.Array, mean: jax.Array,
                         covariance: jax.Array) -> Update:
-        return condition(ssm, LinearizedObservation(value, jacobian, obs_cov), y_row, Moments(mean, covariance))
+        return condition(ssm, LinearisedObservation(value, jacobian, obs_cov), y_row, Moments(mean, covariance))
 
     out_axes = Update(Moments(0, axis), 0, 0, axis, axis, axis, axis, None)  # type: ignore[arg-type]
     updated = jax.vmap(update_particle, (0, axis, axis, 0, axis), out_axes)(

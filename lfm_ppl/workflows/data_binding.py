@@ -139,7 +139,7 @@ def _common_clock(records: Mapping[str, _Record]) -> tuple[str | None, str]:
     """Return the first origin and the unit of the first site; None where times are numbers.
 
     Raises:
-        ValueError: the times of some sites are dates and those of others are not, or their clocks have no common zero.
+        ValueError: the times of some sites alone are dates, or the clocks of the sites have no common zero.
     """
     first = next(iter(records.values()))
     origins = {name: record.origin for name, record in records.items()}

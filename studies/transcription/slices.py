@@ -3,7 +3,7 @@
 1. Sample the force by elliptical slices of the likelihood L, with ellipses of the prior N(0, C), as in the source.
 2. Stop for data sets whose R-hat is at most 1.01.
 3. For the others, approximate L by a Gaussian likelihood l(u) = N(y; H u + b, S), linearised over the draws
-   (`linearize_posterior`). Let N(m, P) be the posterior of the force under l.
+   (`linearise_posterior`). Let N(m, P) be the posterior of the force under l.
 4. Continue with ellipses of N(m, P) and slices of L/l. This leaves the posterior invariant, since N(u; 0, C) L(u) is
    proportional to N(u; m, P) L(u)/l(u). Steps are longer the closer l is to L.
 5. Repeat from step 2, up to five stages in total.
@@ -105,7 +105,7 @@ def ellipses(latent: lfm.LatentGrid, y: jax.Array, gaussian: PosteriorApproximat
     return Ellipses(point, log_ratio, draw, point(jnp.zeros(problem.POINTS) if gaussian is None else gaussian.mean))
 
 
-def linearize_posterior(latent: lfm.LatentGrid, y: jax.Array, draws: jax.Array) -> PosteriorApproximation:
+def linearise_posterior(latent: lfm.LatentGrid, y: jax.Array, draws: jax.Array) -> PosteriorApproximation:
     """Return the Gaussian approximation by linearisation over draws (S, 363).
 
     H is the mean Jacobian of the expression x(u) at the observation times, b the mean of x(u) - H u, and S the
@@ -125,13 +125,13 @@ def linearize_posterior(latent: lfm.LatentGrid, y: jax.Array, draws: jax.Array) 
 
 
 @eqx.filter_jit
-def _linearize_posteriors(draws: jax.Array, link: str, gamma: jax.Array, rates: problem.Rates,
+def _linearise_posteriors(draws: jax.Array, link: str, gamma: jax.Array, rates: problem.Rates,
                           y: jax.Array) -> PosteriorApproximation:
-    """Return `linearize_posterior` for N data sets with draws (N, S, 363)."""
-    def linearize(rates: problem.Rates, *arrays: jax.Array) -> PosteriorApproximation:
-        return linearize_posterior(problem.on_grid(link, gamma, rates), *arrays)
+    """Return `linearise_posterior` for N data sets with draws (N, S, 363)."""
+    def linearise(rates: problem.Rates, *arrays: jax.Array) -> PosteriorApproximation:
+        return linearise_posterior(problem.on_grid(link, gamma, rates), *arrays)
 
-    return jax.vmap(linearize)(rates, y, draws)
+    return jax.vmap(linearise)(rates, y, draws)
 
 
 def compute(settings: Mapping[str, Any], data: list[problem.DataSet], keys: jax.Array) -> Result:
@@ -171,7 +171,7 @@ def compute(settings: Mapping[str, Any], data: list[problem.DataSet], keys: jax.
         if not remaining.size or stage == _STAGES - 1:
             break
         sample = draws[unmixed].reshape(len(unmixed), -1, problem.POINTS)[:, ::_LINEARIZATION_THINNING]
-        gaussian = _linearize_posteriors(jnp.asarray(sample), link, gamma, *problem.rows(inputs, remaining))
+        gaussian = _linearise_posteriors(jnp.asarray(sample), link, gamma, *problem.rows(inputs, remaining))
     return result
 
 

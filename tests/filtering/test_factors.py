@@ -16,7 +16,7 @@ import lfm_ppl as lfm
 from lfm_ppl.filtering.ep.importance import importance_weights
 from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.filtering.moments import Moments
-from lfm_ppl.filtering.update import Factors, LinearizedObservation, multiply_by_factors
+from lfm_ppl.filtering.update import Factors, LinearisedObservation, multiply_by_factors
 
 TIMES = np.linspace(0.0, 8.0, 20)
 THETA = jnp.array([0.1, 0.05, -0.1])
@@ -221,7 +221,7 @@ def test_update_in_natural_parameters_against_dense_algebra():
     precision = np.linalg.inv(prior) + observation_matrix.T @ np.diag(tau) @ observation_matrix
     posterior = np.linalg.inv(precision)
     shift = observation_matrix.T @ (nu - tau * (value - centre))
-    result = multiply_by_factors(LinearizedObservation(jnp.asarray(value), jnp.asarray(h), jnp.asarray(omega)),
+    result = multiply_by_factors(LinearisedObservation(jnp.asarray(value), jnp.asarray(h), jnp.asarray(omega)),
                               Factors(*map(jnp.asarray, (centre, nu, tau))), Moments(jnp.asarray(m), jnp.asarray(p)))
     np.testing.assert_allclose(result.moments.mean, m + (posterior @ shift)[:4], rtol=1e-8)
     np.testing.assert_allclose(result.moments.covariance, posterior[:4, :4], rtol=1e-8)

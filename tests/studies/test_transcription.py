@@ -65,7 +65,7 @@ def test_the_gaussian_of_the_ellipses_is_the_posterior_of_a_linear_link():
     data, latent = linear()
     exact = laplace(latent, data.y)
     draws = jax.vmap(latent.force)(jax.random.normal(jax.random.key(0), (50, 1, problem.POINTS)))[:, 0]
-    gaussian = slices.linearize_posterior(latent, data.y, draws)
+    gaussian = slices.linearise_posterior(latent, data.y, draws)
     assert np.allclose(gaussian.mean, exact.mode[0], atol=1e-7)
     ellipses = slices.ellipses(latent, data.y, gaussian)
     points = jax.vmap(ellipses.draw)(jax.random.split(jax.random.key(1), 4000))

@@ -50,7 +50,7 @@ from lfm_ppl.filtering.ep.moment_matching import (
 )
 from lfm_ppl.filtering.ep.settings import FactorSettings, FixedPointOptions
 from lfm_ppl.filtering.ep.terms import EntryTerms, FamilyTerms
-from lfm_ppl.filtering.forward import FilterTrace, IntervalMaps, LinearizationPoints, forward, maps_about
+from lfm_ppl.filtering.forward import FilterTrace, IntervalMaps, LinearisationPoints, forward, maps_about
 from lfm_ppl.filtering.iterated import smoothed_points
 from lfm_ppl.filtering.moments import Moments, Record, matvec
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals
@@ -69,7 +69,7 @@ class RefinedFactors(NamedTuple):
     """
 
     fixed_point: FixedPoint
-    points: LinearizationPoints | None
+    points: LinearisationPoints | None
     maps: IntervalMaps | None
     assumed: jax.Array
 
@@ -181,7 +181,7 @@ def _factors_from_prior(problem: FilterProblem, terms: FamilyTerms, initial: Mom
                               jnp.where(usable, tilted.variance, cavity.variance))
 
 
-def _smooth_with_factors(problem: FilterProblem, updater: Updater, initial: Moments, points: LinearizationPoints | None,
+def _smooth_with_factors(problem: FilterProblem, updater: Updater, initial: Moments, points: LinearisationPoints | None,
                          record: Record, maps: IntervalMaps | None
                          ) -> tuple[FilterTrace, SmootherTrace, SmoothedPredictor]:
     """Return a forward and an adjoint scan, and the smoothed predictor (T, ...)."""
@@ -191,13 +191,13 @@ def _smooth_with_factors(problem: FilterProblem, updater: Updater, initial: Mome
 
 
 def _joint_sweeps(problem: FilterProblem, terms: EntryTerms, settings: FactorSettings, initial: Moments,
-                  updater: Updater) -> tuple[Factors, LinearizationPoints, FilterTrace]:
+                  updater: Updater) -> tuple[Factors, LinearisationPoints, FilterTrace]:
     """Return factors and points of linearisation, and the first forward scan."""
     grid = problem.grid
     needs_ends_only = grid.steps == 1 and not problem.has_jumps
 
     # A sweep in which an entry has no cavity gives no new factors and points.
-    def sweep(updater: Updater, points: LinearizationPoints | None) -> tuple[tuple, FilterTrace]:
+    def sweep(updater: Updater, points: LinearisationPoints | None) -> tuple[tuple, FilterTrace]:
         # Without nodes inside of an interval its map is all that is needed of it.
         maps = maps_about(problem, points) if points is not None and needs_ends_only else None
         record = Record.LINEARIZATION if maps is None else Record.SMOOTHER
@@ -223,7 +223,7 @@ def _joint_sweeps(problem: FilterProblem, terms: EntryTerms, settings: FactorSet
 
 
 def _sweep_until_converged(problem: FilterProblem, terms: EntryTerms, settings: FactorSettings, initial: Moments,
-                           first: Factors, points: LinearizationPoints | None, maps: IntervalMaps | None) -> FixedPoint:
+                           first: Factors, points: LinearisationPoints | None, maps: IntervalMaps | None) -> FixedPoint:
     def sweep(factors: Factors, is_coarse: jax.Array) -> Sweep:
         _, _, predictor = _smooth_with_factors(problem, FactorUpdate(factors), initial, points, Record.SMOOTHER, maps)
         cavity = cavities(predictor, factors, terms.present, settings.power)

@@ -31,7 +31,7 @@ from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import FilterProblem, at_intervals
 from lfm_ppl.filtering.update import (
     Factors,
-    LinearizedObservation,
+    LinearisedObservation,
     RowUpdate,
     Update,
     multiply_by_factors,
@@ -78,7 +78,7 @@ class MomentMatchingUpdate(NamedTuple):
     def bind(self, problem: FilterProblem, initial: Moments) -> RowUpdate:
         """Return the update of one row."""
 
-        def update(observation: LinearizedObservation, index: jax.Array, y: jax.Array, predicted: Moments) -> Update:
+        def update(observation: LinearisedObservation, index: jax.Array, y: jax.Array, predicted: Moments) -> Update:
             variance = predictor_variance(observation, predicted)
             factors, log_likelihood = row_factors(self.family, observation.value, variance, index, y)
             return multiply_by_factors(observation, factors, predicted)._replace(log_likelihood=log_likelihood)

@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.dynamics import Dynamics, covariance_of, linearize_drift, minimum_sd
+from lfm_ppl.filtering.dynamics import Dynamics, covariance_of, linearise_drift, minimum_sd
 from lfm_ppl.filtering.integrators.integrator import Attempt, RepeatedStep, Section
 from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose, matvec, transform
 from lfm_ppl.filtering.transition import feedback, integrating_factor
@@ -107,7 +107,7 @@ def _exponential_step(dynamics: Dynamics, step: Section, min_sd: jax.Array) -> t
     """
     span, h, moments, about = step
 
-    def linearize_at(node: int, point: Moments) -> LinearSDE:
+    def linearise_at(node: int, point: Moments) -> LinearSDE:
         return _linear_sde(dynamics, span.time(0.5 * node * h), moments.mean, point, min_sd)
 
     def predict(flow: _Flow) -> Prediction:
@@ -115,21 +115,21 @@ def _exponential_step(dynamics: Dynamics, step: Section, min_sd: jax.Array) -> t
         return Prediction(Moments(moments.mean + flow.offset, covariance), flow.phi, flow.process_cov)
 
     if about is not None:
-        nodes = [linearize_at(node, jax.tree.map(lambda a, node=node: a[node], about)) for node in range(3)]
+        nodes = [linearise_at(node, jax.tree.map(lambda a, node=node: a[node], about)) for node in range(3)]
     else:
-        start = linearize_at(0, moments)
+        start = linearise_at(0, moments)
         midpoint = predict(_flow(start, 0.5 * h)).moments
-        middle = linearize_at(1, midpoint)
+        middle = linearise_at(1, midpoint)
         second_order = predict(_flow(middle, h)).moments
-        end = linearize_at(2, second_order)
+        end = linearise_at(2, second_order)
         if not dynamics.ssm.plan.is_autonomous:
             # XLA removes this where the error is not used.
             deviation = midpoint.mean - moments.mean
             offsets = [matvec(sde.feedback - middle.feedback, deviation) + sde.offset
-                       for sde in (linearize_at(0, midpoint), linearize_at(2, midpoint))]
+                       for sde in (linearise_at(0, midpoint), linearise_at(2, midpoint))]
             driven = middle._replace(offset=0.5 * (offsets[0] + offsets[1]), change=offsets[1] - offsets[0])
             second_order = predict(_flow(driven, h)).moments
-        nodes = [start, linearize_at(1, predict(_flow(_combine(_TO_MIDDLE, start, middle, end), 0.5 * h)).moments), end]
+        nodes = [start, linearise_at(1, predict(_flow(_combine(_TO_MIDDLE, start, middle, end), 0.5 * h)).moments), end]
     first, second = (_flow(_combine(weights, *nodes), 0.5 * h) for weights in (_FIRST_HALF, _SECOND_HALF))
     offset = matvec(second.phi, first.offset) + second.offset
     prediction = predict(_Flow(offset, *compose(first[1:], second[1:])))
@@ -139,7 +139,7 @@ def _exponential_step(dynamics: Dynamics, step: Section, min_sd: jax.Array) -> t
 def _linear_sde(dynamics: Dynamics, t: jax.Array, origin: jax.Array, point: Moments, min_sd: jax.Array) -> LinearSDE:
     """Linearise the dynamics about moments at a time, as a constant SDE of the deviation from ``origin`` (n,)."""
     ssm, size = dynamics.ssm, dynamics.ssm.physical_dim
-    drift = linearize_drift(dynamics, t, origin, covariance_of(point), min_sd, point)
+    drift = linearise_drift(dynamics, t, origin, covariance_of(point), min_sd, point)
     matrix = feedback(ssm, dynamics.linear)
     offset = matvec(matrix, origin).at[:size].add(drift.remainder)
     state_noise = jnp.zeros((size, size)) if drift.diffusion is None else drift.diffusion

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lfm_ppl.filtering.dynamics import Dynamics, columns, linearization_indices, minimum_sd
+from lfm_ppl.filtering.dynamics import Dynamics, columns, linearisation_indices, minimum_sd
 from lfm_ppl.filtering.moments import Moments, Prediction, Record, compose
 from lfm_ppl.filtering.transition import integrating_factor
 from lfm_ppl.model.state_space import Span
@@ -209,7 +209,7 @@ def identity_prediction(dynamics: Dynamics, moments: Moments, record: Record, st
 def _step_record(dynamics: Dynamics, step: Prediction, record: Record) -> StepRecord | None:
     if record is not Record.LINEARIZATION:
         return None
-    indices = linearization_indices(dynamics.ssm, dynamics.rule)
+    indices = linearisation_indices(dynamics.ssm, dynamics.rule)
     return StepRecord(columns(step.moments.mean, indices), columns(step.moments.covariance, indices).T, step.phi)
 
 

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lfm_ppl.filtering.dynamics import DriftLinearization, Dynamics, linearize_drift, minimum_sd
+from lfm_ppl.filtering.dynamics import DriftLinearisation, Dynamics, linearise_drift, minimum_sd
 from lfm_ppl.filtering.integrators.integrator import (
     EqualSteps,
     Section,
@@ -109,14 +109,14 @@ def _step_maps(dynamics: Dynamics, factor: IntegratingFactor, interval: Section,
     forces = _force_moments(factor, steps, _forces_of(moments, size), size)
     point = forces if about is None else jax.tree.map(insert_midpoints, _forces_of(about, size))
 
-    def linearize_node(t: jax.Array, mean: jax.Array, point: Moments) -> _Node:
+    def linearise_node(t: jax.Array, mean: jax.Array, point: Moments) -> _Node:
         # The drift without its constant linear part does not depend on the physical state here: any value will do.
         centre = jnp.concatenate([jnp.zeros(size), point.mean])
 
         def covariance(rows: jax.Array, reads_forces_only: bool) -> jax.Array:
             return congruence(rows[:, size:], point.covariance)
 
-        drift: DriftLinearization = linearize_drift(dynamics, t, centre, covariance, min_sd)
+        drift: DriftLinearisation = linearise_drift(dynamics, t, centre, covariance, min_sd)
         jacobian, remainder = drift.jacobian[:, size:], drift.remainder
         if about is not None:
             remainder = remainder + matvec(jacobian, mean - point.mean)
@@ -124,13 +124,13 @@ def _step_maps(dynamics: Dynamics, factor: IntegratingFactor, interval: Section,
 
     if ssm.plan.is_autonomous:
         times = span.time(0.5 * h * jnp.arange(2 * steps + 1))
-        nodes = jax.vmap(linearize_node)(times, forces.mean, point)
+        nodes = jax.vmap(linearise_node)(times, forces.mean, point)
         first_middle_last = [jax.tree.map(lambda a, part=part: a[part], nodes) for part in _FIRST_MIDDLE_LAST]
     else:
         # The last node of a step and the first of the next one are at different sides of a jump of an input.
         offsets = jnp.arange(steps) * h
         times = jnp.stack([span.time(offsets), span.time(offsets + 0.5 * h), span.time(offsets + h)])
-        nodes = jax.vmap(jax.vmap(linearize_node))(times, _by_node(forces.mean), jax.tree.map(_by_node, point))
+        nodes = jax.vmap(jax.vmap(linearise_node))(times, _by_node(forces.mean), jax.tree.map(_by_node, point))
         first_middle_last = [jax.tree.map(lambda a, index=index: a[index], nodes) for index in range(3)]
     # All steps at once: a loop would store its intermediate results step by step for the derivative.
     return jax.vmap(lambda *nodes: _simpson_step(factor, h, nodes, size))(*first_middle_last)

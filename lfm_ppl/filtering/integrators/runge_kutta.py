@@ -27,10 +27,10 @@ import numpy as np
 
 from lfm_ppl.filtering.dynamics import (
     Congruence,
-    DriftLinearization,
+    DriftLinearisation,
     Dynamics,
     covariance_of,
-    linearize_drift,
+    linearise_drift,
     minimum_sd,
 )
 from lfm_ppl.filtering.integrators.integrator import Attempt, RepeatedStep, Section
@@ -48,7 +48,7 @@ _STABILITY_LIMIT = 10.0
 class FourthStage(NamedTuple):
     """The stage at the end of a step, and the covariance (n, n) about which it was linearised."""
 
-    drift: DriftLinearization
+    drift: DriftLinearisation
     covariance: jax.Array
 
 
@@ -68,24 +68,24 @@ class RungeKutta(RepeatedStep):
         return _runge_kutta_step(dynamics, table, step, min_sd)[0]
 
     def attempts(self, dynamics: Dynamics, interval: Section,
-                 record: Record) -> tuple[DriftLinearization, Callable[[Section, Any], Attempt]]:
+                 record: Record) -> tuple[DriftLinearisation, Callable[[Section, Any], Attempt]]:
         """Return the linearised dynamics at the start of an interval, and the function (step, stage) -> `Attempt`."""
         ssm, span = dynamics.ssm, interval.span
         factor_of_interval = integrating_factor(ssm, dynamics.linear, interval.length)
         min_sd = minimum_sd(dynamics, factor_of_interval, span.time(), interval.length, interval.moments)
 
-        def linearize_at(t: jax.Array, moments: Moments) -> DriftLinearization:
-            return linearize_drift(dynamics, t, moments.mean, covariance_of(moments), min_sd)
+        def linearise_at(t: jax.Array, moments: Moments) -> DriftLinearisation:
+            return linearise_drift(dynamics, t, moments.mean, covariance_of(moments), min_sd)
 
         def attempt(step: Section, stage: Any) -> Attempt:
             factor = integrating_factor(ssm, dynamics.linear, step.length)
             prediction, stage4 = _runge_kutta_step(dynamics, factor, step, min_sd, stage)
-            stage5 = linearize_at(step.span.time(step.length), prediction.moments)
+            stage5 = linearise_at(step.span.time(step.length), prediction.moments)
             error = jax.tree.map(_larger, _stage_error(step.length, prediction.moments, stage4, stage5),
                                  _linear_part_error(dynamics, factor, step, stage))
             return Attempt(prediction, error, stage5)
 
-        return linearize_at(span.time(), interval.moments), attempt
+        return linearise_at(span.time(), interval.moments), attempt
 
     def longest_step(self, stage: Any) -> jax.Array | None:
         """Return the longest step that stays finite where it is rejected, with its derivative, which is not used."""
@@ -93,7 +93,7 @@ class RungeKutta(RepeatedStep):
 
 
 def _runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, step: Section, min_sd: jax.Array,
-                      stage1: DriftLinearization | None = None) -> tuple[Prediction, FourthStage]:
+                      stage1: DriftLinearisation | None = None) -> tuple[Prediction, FourthStage]:
     """Predict over one step.
 
     Args:
@@ -109,12 +109,12 @@ def _runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, step: Secti
     half_x, full_x = half[:size], full[:size]
     identity = jnp.eye(dynamics.ssm.state_dim)
 
-    def linearize_stage(node: int, t: jax.Array, mean: jax.Array, covariance: Congruence) -> DriftLinearization:
+    def linearise_stage(node: int, t: jax.Array, mean: jax.Array, covariance: Congruence) -> DriftLinearisation:
         point = jax.tree.map(lambda a: a[node], about)
-        return linearize_drift(dynamics, t, mean, covariance, min_sd, point)
+        return linearise_drift(dynamics, t, mean, covariance, min_sd, point)
 
     # Increments of the transition matrix and of the mean are columns of one matrix (M, n + 1).
-    def increment(stage: DriftLinearization, phi: jax.Array) -> jax.Array:
+    def increment(stage: DriftLinearisation, phi: jax.Array) -> jax.Array:
         return jnp.concatenate([matmul(stage.jacobian, phi), stage.remainder[:, None]], axis=1)
 
     start = jnp.concatenate([identity, m[:, None]], axis=1)
@@ -125,7 +125,7 @@ def _runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, step: Secti
         return state[:, :-1], state[:, -1]
 
     if stage1 is None:
-        stage1 = linearize_stage(0, span.time(), m, covariance_of(step.moments))
+        stage1 = linearise_stage(0, span.time(), m, covariance_of(step.moments))
     k1 = increment(stage1, identity)
     phi2, m2 = add_increment(to_half, 0.5 * h * matmul(half[:size, :size], k1))
 
@@ -133,7 +133,7 @@ def _runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, step: Secti
         return process_cov_at(factor, 0, phi2[:size][None], stack_diffusions(stage1.diffusion),
                               jnp.reshape(0.5 * h, 1), size)
 
-    stage2 = linearize_stage(1, span.time(0.5 * h), m2,
+    stage2 = linearise_stage(1, span.time(0.5 * h), m2,
                              _propagated_covariance(p, phi2, process_cov_at_stage2, factor.force_cov_half, size))
     k2 = increment(stage2, phi2)
     z2 = 0.5 * h * stage1.jacobian
@@ -145,7 +145,7 @@ def _runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, step: Secti
         return process_cov_at(factor, 1, transport3[None], stack_diffusions(stage2.diffusion),
                               jnp.reshape(0.5 * h, 1), size)
 
-    stage3 = linearize_stage(1, span.time(0.5 * h), m3,
+    stage3 = linearise_stage(1, span.time(0.5 * h), m3,
                              _propagated_covariance(p, phi3, process_cov_at_stage3, factor.force_cov_half, size))
     k3 = increment(stage3, phi3)
     z3 = _inverse_transition(0.5 * h, z2, back_half, stage2.jacobian, half, size)
@@ -157,7 +157,7 @@ def _runge_kutta_step(dynamics: Dynamics, factor: IntegratingFactor, step: Secti
         return process_cov_at(factor, 2, transport4[None], stack_diffusions(stage3.diffusion), jnp.reshape(h, 1), size)
 
     covariance4 = _propagated_covariance(p, phi4, process_cov_at_stage4, factor.force_cov_full, size)
-    stage4 = linearize_stage(2, span.time(h), m4, covariance4)
+    stage4 = linearise_stage(2, span.time(h), m4, covariance4)
     k4 = increment(stage4, phi4)
     z4 = _inverse_transition(h, z3, back_half, stage3.jacobian, half, size)
 
@@ -233,7 +233,7 @@ def process_cov_at(factor: IntegratingFactor, stage: int, transports: jax.Array,
                             jnp.concatenate([cross.T, exact], axis=1)])
 
 
-def _stage_error(h: jax.Array, end: Moments, stage4: FourthStage, stage5: DriftLinearization) -> Moments:
+def _stage_error(h: jax.Array, end: Moments, stage4: FourthStage, stage5: DriftLinearisation) -> Moments:
     """Return the estimated errors of the mean (M,) and of the rows (M, n) of the covariance at the end of a step."""
     size = stage5.remainder.shape[0]
     mean = stage4.drift.remainder - stage5.remainder
@@ -245,7 +245,7 @@ def _stage_error(h: jax.Array, end: Moments, stage4: FourthStage, stage5: DriftL
 
 
 def _linear_part_error(dynamics: Dynamics, factor: IntegratingFactor, step: Section,
-                       stage1: DriftLinearization) -> Moments:
+                       stage1: DriftLinearisation) -> Moments:
     """Return the errors of the mean (M,) and the covariance (M, n) due to a fast linear part.
 
     The step replaces the integral of exp(A s) r ds, of the remainder r of the dynamics, by Simpson's rule W r. Its
