@@ -159,11 +159,11 @@ def summary(result: Any) -> pd.DataFrame:
         Columns mean, sd, q2.5, q97.5 (quantiles in percent), truth (where a result has it), mcse_mean, ess_bulk,
         ess_tail (the smaller effective size of the 5% and the 95% quantile), r_hat (rank-normalised split R-hat); rows
         labelled ``noise_sd`` or ``decay[CDKN1A]``. Diagnostics are NaN where they do not exist: R-hat of one chain, and
-        all diagnostics of fewer than four draws, or of draws that are constant or not finite. Resampled draws are no chains: the
-        effective size is that of the importance weights, and there is no R-hat. Draws of a Laplace approximation
-        (sampler "map") are independent: the columns are mode, mean, sd, q2.5, q97.5, truth, and ``warnings`` where the
-        mode of a parameter is degenerate. A run that was stopped has a further column, ``partial``, with the number of
-        draws.
+        all diagnostics of fewer than four draws, or of draws that are constant or not finite. Resampled draws are no
+        chains: the effective size is that of the importance weights, and there is no R-hat. Draws of a Laplace
+        approximation (sampler "map") are independent: the columns are mode, mean, sd, q2.5, q97.5, truth, and
+        ``warnings`` where the mode of a parameter is degenerate. A run that was stopped has a further column,
+        ``partial``, with the number of draws.
 
     Raises:
         ValueError: the result has no posterior.
