@@ -35,7 +35,6 @@ import numpyro.distributions as dist
 
 import lfm_ppl as lfm
 from lfm_ppl.results import tables
-from lfm_ppl.results.arviz_data import summary
 
 quick = bool(os.environ.get("LFM_QUICK"))
 size = dict(chains=2, warmup=50, samples=50) if quick else dict(chains=4, warmup=1000, samples=1000)
@@ -91,7 +90,7 @@ y[[6, 7, 15]] = np.nan
 requested_times = np.linspace(0.0, 27.0, 136)
 simulated_truth = {"times": grid, "forces": simulation.forces, "state": simulation.state, "parameters": truth}
 result = lfm.fit(motif, times, y, at=requested_times, truth=simulated_truth, progress=False, **size)
-print(tables.text_table(summary(result)))
+print(tables.text_table(lfm.summary(result)))
 
 # %% [markdown]
 # ## What the data say

@@ -41,7 +41,7 @@ import pandas as pd
 import lfm_ppl as lfm
 from lfm_ppl.io import loading
 from lfm_ppl.results import tables
-from lfm_ppl.results.arviz_data import convergence_warnings, summary
+from lfm_ppl.results.arviz_data import convergence_warnings
 
 quick = bool(os.environ.get("LFM_QUICK"))
 size = dict(chains=2, warmup=50, samples=50) if quick else dict(chains=4, warmup=1000, samples=1000)
@@ -88,7 +88,7 @@ result = lfm.fit(
     progress=False,
     **size,
 )
-print(tables.text_table(summary(result)))
+print(tables.text_table(lfm.summary(result)))
 print("\n".join(convergence_warnings(result)) or "No complaint about convergence.")
 print(f"{result.attrs['wall_time_s']:.0f} s")
 

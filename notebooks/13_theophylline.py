@@ -48,7 +48,6 @@ import pandas as pd
 from scipy.optimize import least_squares
 
 import lfm_ppl as lfm
-from lfm_ppl.results.arviz_data import summary
 
 quick = bool(os.environ.get("LFM_QUICK"))
 
@@ -120,7 +119,7 @@ def model(times, y=None, doses=None):
 draws = {"chains": 2, "warmup": 30, "samples": 30} if quick else {"chains": 2, "warmup": 500, "samples": 750}
 result = lfm.fit(model, times, y, model_kwargs={"doses": doses}, coords={"subject": subjects.tolist()}, progress=False,
                  seed=1, **draws)
-summary(result).filter(regex="_mean|_sd|scale", axis=0)
+lfm.summary(result).filter(regex="_mean|_sd|scale", axis=0)
 
 # %% [markdown]
 # The concentrations of all subjects: posterior mean, 95% bands of the noise-free concentration and of new data.

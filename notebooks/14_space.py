@@ -38,7 +38,6 @@ import numpy as np
 import numpyro.distributions as dist
 
 import lfm_ppl as lfm
-from lfm_ppl.results.arviz_data import summary
 
 quick = bool(os.environ.get("LFM_QUICK"))
 
@@ -96,7 +95,7 @@ def rod(times, y=None):
 
 draws = {"chains": 2, "warmup": 20, "samples": 20} if quick else {"chains": 2, "warmup": 150, "samples": 300}
 result = lfm.fit(rod, times, y, progress=False, seed=1, **draws)
-summary(result)
+lfm.summary(result)
 
 # %% [markdown]
 # `lfm.plot_field` draws the posterior of a field: mean and standard deviation against place and time, and three
@@ -174,7 +173,7 @@ print(f"{int(counts.sum())} events")
 # %%
 intensity = lfm.fit(events, periods, counts, sampler="map", seed=2, progress=False,
                     **({"samples": 20} if quick else {"samples": 100}))
-summary(intensity).filter(items=["mean", "sd"])
+lfm.summary(intensity).filter(items=["mean", "sd"])
 
 # %%
 lfm.plot_field(intensity, rate_field, sensors=cells, name="log rate", width="full")

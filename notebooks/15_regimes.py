@@ -41,7 +41,6 @@ import pandas as pd
 
 import lfm_ppl as lfm
 from lfm_ppl.io import loading
-from lfm_ppl.results.arviz_data import summary
 from lfm_ppl.switching.chain import MarkovChain, transition_matrices
 
 quick = bool(os.environ.get("LFM_QUICK"))
@@ -159,7 +158,7 @@ print(f"{len(ages)} rows from {-ages[0]:.2f} to {-ages[-1]:.2f} kyr before prese
 draws = {"warmup": 30, "samples": 30, "trajectory_draws": 60} if quick else {"warmup": 300, "samples": 500}
 result = lfm.fit(file.model, ages, isotopes, model_kwargs={"units": dict(file.units)}, chains=2, progress=False, seed=1,
                  **draws)
-summary(result)
+lfm.summary(result)
 
 # %% [markdown]
 # The state, and the probabilities of the regimes:

@@ -38,7 +38,6 @@ import numpyro.distributions as dist
 from numpyro.infer import MCMC, NUTS, Predictive
 
 import lfm_ppl as lfm
-from lfm_ppl.results.arviz_data import summary
 
 quick = bool(os.environ.get("LFM_QUICK"))
 size = {"chains": 2, "warmup": 30, "samples": 30} if quick else {"chains": 2, "warmup": 300, "samples": 500}
@@ -108,7 +107,7 @@ print(f"central 90% of the prior: {np.quantile(prior['y'], 0.05):.0f} to {np.qua
 
 # %%
 result = lfm.fit(room, fitted, seed=1, progress=False, **size)
-summary(result)
+lfm.summary(result)
 
 # %%
 lfm.plot_fit(result, width="full")
@@ -145,7 +144,7 @@ print(lfm.check_accuracy(result, room, progress=False))
 # %%
 constant = lfm.fit(room, fitted, seed=2, progress=False, model_kwargs={"varying": False}, **size)
 print(az.compare({"varying heat": result, "constant heat": constant}).to_string())
-summary(constant)
+lfm.summary(constant)
 
 # %% [markdown]
 # ## Forecast and score
@@ -199,7 +198,7 @@ mcmc = MCMC(NUTS(room), num_warmup=size["warmup"], num_samples=size["samples"], 
             chain_method="vectorized", progress_bar=False)
 mcmc.run(jax.random.key(5), fitted.times, fitted.y, inputs=data.known_inputs())
 plain = lfm.to_arviz(mcmc, room, fitted.times, fitted.y, model_kwargs={"inputs": data.known_inputs()})
-summary(plain).filter(items=["mean", "sd", "r_hat"]).join(summary(result)[["mean", "sd"]], rsuffix=" of lfm.fit")
+lfm.summary(plain).filter(items=["mean", "sd", "r_hat"]).join(lfm.summary(result)[["mean", "sd"]], rsuffix=" of fit")
 
 # %%
 true_heat = np.interp(fitted.times, data.truth["times"], np.asarray(data.truth["forces"]["heat"]))

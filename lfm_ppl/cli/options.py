@@ -249,8 +249,8 @@ class Approximation:
     method: Annotated[str, Parameter(metavar="METHOD", validator=_check_method)] | None = None
     """method of integration: runge-kutta, or exponential for stiff dynamics (default: runge-kutta)"""
     iterations: CountOrZero | None = None
-    """iterations of posterior linearisation; 0: a single pass (default: 3; 0 for linear models, observation families
-    and --tolerance)"""
+    """iterations of posterior linearisation; 0: a single pass (default: 3, or as many as nuts and ram find to suffice;
+    0 for linear models, observation families and --tolerance)"""
     lower: Pairs = ()
     """lower bound of a state, force or output, such as "transcription factor=0"; may be repeated; each likelihood then
     costs some hundred times as much"""

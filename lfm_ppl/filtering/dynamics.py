@@ -134,7 +134,7 @@ def linearise_drift(dynamics: Dynamics, t: jax.Array, mean: jax.Array, covarianc
     Args:
         dynamics: the model and the rule.
         t: time of the node.
-        mean: (n,), of the filter at the node.
+        mean: (n,), where the affine drift is evaluated: that of the filter at the node, or the origin of deviations.
         covariance: of the filter at the node.
         min_sd: see `minimum_sd`.
         about: moments to linearise about; None: the filter's moments.

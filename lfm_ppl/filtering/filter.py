@@ -94,7 +94,7 @@ def filter(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
             missing (a prediction). Results equal a single pass over all times, and calls with equally many new times
             share one compilation. An observation covariance for each time has the entries of the new times.
         tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
-        method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
+        method: of integration, as in `lfm_ppl.MarginalLikelihood`.
 
     Returns:
         Log likelihoods, moments and residuals, by observation.

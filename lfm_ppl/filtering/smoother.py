@@ -191,7 +191,7 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
             a model that is not linear, so that both compute the same log likelihood.
         damping: largest fraction of each new iterate that is taken, in (0, 1]; less where the iterates turn back.
         tolerance: largest error of an integration step, in standard deviations, as in `lfm_ppl.MarginalLikelihood`.
-        method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
+        method: of integration, as in `lfm_ppl.MarginalLikelihood`.
         factors: of an observation family, how its factors are refined: "ep" (the default), "variational", "laplace", or
             `lfm_ppl.FactorSettings`.
         about: smoothed moments from which the iterations start, as in `lfm_ppl.MarginalLikelihood`; at requested times

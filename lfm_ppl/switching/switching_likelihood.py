@@ -107,7 +107,7 @@ class Switching(SeriesLikelihood):
         initial: (K,), probabilities of the regimes at the first observation; None: equal ones.
         merging: "gpb2", K^2 filters a row; "gpb3" and "gpb4", K^3 and K^4 filters, for regimes whose states stay
             apart; or "imm", K filters, which is faster and merges earlier.
-        method: of integration, "runge-kutta" or, for stiff dynamics, "exponential", as in `lfm_ppl.MarginalLikelihood`.
+        method: of integration, as in `lfm_ppl.MarginalLikelihood`.
 
     Raises:
         ValueError, TypeError: the models differ in states or outputs; a rate or a probability is invalid; and as

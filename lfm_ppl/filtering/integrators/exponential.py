@@ -108,7 +108,7 @@ def _exponential_step(dynamics: Dynamics, step: Section, min_sd: jax.Array) -> t
     span, h, moments, about = step
 
     def linearise_at(node: int, point: Moments) -> LinearSDE:
-        return _linear_sde(dynamics, span.time(0.5 * node * h), moments.mean, point, min_sd)
+        return linear_sde(dynamics, span.time(0.5 * node * h), moments.mean, point, min_sd)
 
     def predict(flow: _Flow) -> Prediction:
         covariance = transform(moments, flow.phi, flow.process_cov).covariance
@@ -136,7 +136,7 @@ def _exponential_step(dynamics: Dynamics, step: Section, min_sd: jax.Array) -> t
     return prediction, None if about is not None else jax.tree.map(jnp.subtract, prediction.moments, second_order)
 
 
-def _linear_sde(dynamics: Dynamics, t: jax.Array, origin: jax.Array, point: Moments, min_sd: jax.Array) -> LinearSDE:
+def linear_sde(dynamics: Dynamics, t: jax.Array, origin: jax.Array, point: Moments, min_sd: jax.Array) -> LinearSDE:
     """Linearise the dynamics about moments at a time, as a constant SDE of the deviation from ``origin`` (n,)."""
     ssm, size = dynamics.ssm, dynamics.ssm.physical_dim
     drift = linearise_drift(dynamics, t, origin, covariance_of(point), min_sd, point)

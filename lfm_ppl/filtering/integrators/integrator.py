@@ -85,8 +85,9 @@ class Integrator(abc.ABC):
 
     Attributes:
         stepping: the steps that it takes.
-        is_explicit: whether a step is unstable where a state decays within it. A step that is not explicit lets a fast
-            state settle.
+        is_explicit: whether a step is unstable where a state decays within it. Long steps then warn, and models that
+            are linearised in forces alone take a quadrature instead. A step that is not explicit lets a fast state
+            settle, and simulations take exponential steps.
     """
 
     stepping: ClassVar[Stepping]
@@ -121,7 +122,8 @@ class EqualSteps(Integrator):
     """Prediction in steps of equal length.
 
     Attributes:
-        error_order: order in the length of a step of the error that an attempt estimates.
+        error_order: order in the length of a step of the error that an attempt estimates: p + 1 for a method of order p
+            with the attempts by default.
     """
 
     stepping: ClassVar[Stepping] = Stepping.EQUAL
