@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -39,17 +40,19 @@ def even_forces(model: LatentForceModel, times: Any) -> list[str]:
     mean, measurement = stack.mean_at(start), stack.measurement(start)
     sds = jnp.sqrt(jnp.diagonal(measurement @ stack.initial_covariance() @ measurement.T))
 
-    def values(forces: Any) -> np.ndarray:
-        return np.concatenate([np.ravel(model.drift(state, forces, start)),
-                               np.ravel(model.observation.function(state, forces, start))])
+    def values(forces: Any) -> jax.Array:
+        return jnp.concatenate([jnp.ravel(model.drift(state, forces, start)),
+                                jnp.ravel(model.observation.function(state, forces, start))])
 
-    centre, names = values(mean), []
+    centre = values(mean)
+    if checks.traced(centre):  # in compiled code, or by a variable that a function reads
+        return []
+    rounding, names = _ROUNDING * float(jnp.abs(centre).max(initial=0.0)), []
     for index, name in enumerate(model.force_names):
         above, below = (values(mean.at[index].add(sign * sds[index])) for sign in (1.0, -1.0))
-        even, odd = above + below - 2.0 * centre, above - below
-        size = np.abs(even).max(initial=0.0)
+        size = float(jnp.abs(above + below - 2.0 * centre).max(initial=0.0))
         # Rounding of the centre is no dependence.
-        if size > _ROUNDING * np.abs(centre).max(initial=0.0) and np.abs(odd).max(initial=0.0) <= _ROUNDING * size:
+        if size > rounding and float(jnp.abs(above - below).max(initial=0.0)) <= _ROUNDING * size:
             names.append(name)
     return names
 

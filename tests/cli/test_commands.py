@@ -150,12 +150,12 @@ def test_plot_draws_a_saved_result_again(run, original):
 
 
 @pytest.mark.usefixtures("without_sampling")
-@pytest.mark.parametrize("name", ["plots.save_figures", "html_report.save_report"])
+@pytest.mark.parametrize("name", ["plots.save_figures", "report.html_report.save_report"])
 def test_a_figure_or_a_page_that_fails_does_not_cost_the_draws(run, well, tmp_path, monkeypatch, name):
     def fail(*arguments, **keywords):
         raise RuntimeError("no ink")
 
-    monkeypatch.setattr(f"lfm_ppl.results.{name}", fail)
+    monkeypatch.setattr(f"lfm_ppl.{name}", fail)
     status, _, err = run(f"fit {well} --out r")
     assert status == 1 and "no ink" in err and (tmp_path / "r" / "posterior.nc").is_file()
 

@@ -58,3 +58,12 @@ def test_the_filter_learns_nothing_of_the_force_and_warns():
         warnings.simplefilter("error", lfm.forces.ApproximationWarning)
         result = lfm.smooth(SEEN["softplus"], TIMES, y)
     assert np.abs(result.force("u")[0]).max() > 0.1
+
+
+def test_compiled_code_is_not_checked():
+    def log_prob(y):
+        return lfm.MarginalLikelihood(EVEN["square"], TIMES, iterations=0).log_prob(y)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", lfm.forces.ApproximationWarning)
+        assert np.isfinite(jax.jit(log_prob)(np.sin(TIMES)[:, None]))

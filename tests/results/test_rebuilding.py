@@ -47,8 +47,8 @@ def test_a_later_input_follows_that_of_the_fit(table, times):
     ("heater", ([0.0, 1.0], [1.0, 0.0]), "is 1 at time 0"), ("heater", ([6.0], [1.0], "linear"), "one manner"),
     ("outside", ([4.0, 8.0], [4.0, 9.0]), "'outside' .* is 4 at time 4"),
     ("heater", ([6.0], [1.0], "dose:gut"), "manner"),
-    ("dose", ([0.0, 12.0], [4.0, 4.0], "dose:gut"), "at time 3 are none, .* of the fit are 4 to gut"),
-    ("dose", ([2.0, 12.0], [1.0, 4.0], "dose:gut"), "at time 2 are 1 to gut, .* are none"),
+    ("dose", ([0.0, 12.0], [4.0, 4.0], "dose:gut"), "at time 3 are none, .* the fit has 4 to gut"),
+    ("dose", ([2.0, 12.0], [1.0, 4.0], "dose:gut"), "at time 2 are 1 to gut, .* has none"),
     ("dose", ([0.0, 3.0], [4.0, 4.0], "dose:blood"), "to blood|to gut"), ("heater", ([6.0, 7.0], [1.0]), "one value"),
 ])
 def test_an_input_that_differs_before_the_last_observation_is_refused(name, table, words):
