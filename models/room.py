@@ -51,7 +51,7 @@ def build(inputs, loss, gain, scale, lengthscale, noise_sd, units=None) -> lfm.L
     return lfm.LatentForceModel(
         dynamics=dynamics,
         forces={"heat": lfm.Matern(scale=scale, lengthscale=lengthscale, order=1)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
+        observation=lfm.GaussianObservation(lambda x, u, t: x, sd=noise_sd),
         initial_state=lfm.Gaussian(jnp.array([18.0]), 9.0 * jnp.eye(1)),
         state_names=("x",),
         output_names=OUTPUTS,

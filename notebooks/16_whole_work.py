@@ -78,7 +78,7 @@ def room(times, y=None, inputs=None, varying=True):
     system = lfm.LatentForceModel(
         dynamics=lambda x, u, t: loss * (inputs["outside"](t) - x) + gain * inputs["heater"](t) + u,
         forces={"heat": heat},
-        observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
+        observation=lfm.GaussianObservation(lambda x, u, t: x, sd=noise_sd),
         initial_state=lfm.Gaussian(jnp.array([18.0]), 9.0 * jnp.eye(1)),
         output_names=("temperature",), state_names=("x",), units=data.units)
     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
@@ -142,7 +142,7 @@ print(lfm.check_accuracy(result, room, progress=False))
 # temperature from all others (expected log predictive density, leave-one-out).
 
 # %%
-constant = lfm.fit(room, fitted, seed=2, progress=False, model_kwargs={"varying": False}, **size)
+constant = lfm.fit(room, replace(fitted, truth=None), seed=2, progress=False, model_kwargs={"varying": False}, **size)
 print(az.compare({"varying heat": result, "constant heat": constant}).to_string())
 lfm.summary(constant)
 
@@ -175,7 +175,8 @@ for name, table in scores.items():
 # six, and stands beside persistence, the last value with the spread of its changes.
 
 # %%
-rolling = lfm.backtest(room, data, horizon=6, every=6, first=25, draws=50 if quick else 200, seed=4)
+rolling = lfm.backtest(room, data, horizon=6, every=6, first=25, draws=50 if quick else 200, seed=4,
+                       progress=False)
 rolling.table.round(3)
 
 # %% [markdown]
@@ -198,7 +199,7 @@ mcmc = MCMC(NUTS(room), num_warmup=size["warmup"], num_samples=size["samples"], 
             chain_method="vectorized", progress_bar=False)
 mcmc.run(jax.random.key(5), fitted.times, fitted.y, inputs=data.known_inputs())
 plain = lfm.to_arviz(mcmc, room, fitted.times, fitted.y, model_kwargs={"inputs": data.known_inputs()})
-lfm.summary(plain).filter(items=["mean", "sd", "r_hat"]).join(lfm.summary(result)[["mean", "sd"]], rsuffix=" of fit")
+lfm.summary(plain)[["mean", "sd", "r_hat"]].join(lfm.summary(result)[["mean", "sd"]].add_suffix(" of lfm.fit"))
 
 # %%
 true_heat = np.interp(fitted.times, data.truth["times"], np.asarray(data.truth["forces"]["heat"]))

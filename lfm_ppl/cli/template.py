@@ -49,8 +49,8 @@ def build(loss, scale, lengthscale, noise_sd):
         # order 1 is a Matern-3/2: once differentiable. Others: lfm.SquaredExponential, lfm.Periodic, sums of them.
         # A mean that is not zero: mean=... (a number or a function of time).
         forces={"heat": lfm.Matern(scale=scale, lengthscale=lengthscale, order=1)},
-        # What is measured of (x, u), and the variance of the noise of each output (a function of x, u, t where it
-        # differs: lambda x, u, t: (0.1 * x) ** 2 for an error of 10%).
+        # What is measured of (x, u), and the standard deviation of its noise, for each output. Where it differs, it is
+        # a function of x, u, t: sd=lambda x, u, t: 0.1 * x for an error of 10%.
         observation=lfm.GaussianObservation(lambda x, u, t: x, sd=noise_sd),
         # What is known of the state at the first time: mean (M,) and covariance (M, M).
         initial_state=lfm.Gaussian(jnp.array([15.0]), 25.0 * jnp.eye(1)),

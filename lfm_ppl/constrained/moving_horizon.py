@@ -205,6 +205,8 @@ class MovingHorizon(eqx.Module):
                              "window of at most their number (of exactly it: lfm.full_information).")
         initial_time = row_times[0] if model.initial_time is None else model.initial_time
         model.check_at(initial_time, len(row_times))
+        if not settings.linear and model.initial_time is None and not checks.traced(initial_time):
+            check_noise(settings.ssm, initial_time)
         y = check_observations(y, len(row_times), len(model.output_names))
         if not checks.traced(initial_time):
             _warn_of_breakpoints(model, row_times, float(initial_time))
@@ -279,8 +281,8 @@ def _build_settings(model: LatentForceModel, constraints: Constraints, window: i
     index = np.arange(window)
     ssm = augmented_model(model, constraints, Rows(index, index, index, np.zeros(window, int)))
     linear = ssm.plan.has_fixed_weights
-    if not linear:
-        check_noise(ssm, 0.0 if model.initial_time is None else model.initial_time)
+    if not linear and model.initial_time is not None:
+        check_noise(ssm, model.initial_time)
     warn_single_precision()
     return HorizonSettings(ssm, filter_ssm, constraints, linear, int(window), int(delay), int(steps), float(tolerance),
                            max_passes)

@@ -58,16 +58,20 @@ class Anchor(NamedTuple):
     """Smoothed moments at one point of the parameters, from which the iterations at other points start.
 
     Attributes:
+        initial_time: of the grid on which they were computed.
         since, length: (N,) starts of the intervals, counted from the initial time, and their lengths.
         points: moments about which the first pass is linearised.
         variance_share: (N, J + 1, k), share of the variance that a pass predicts at the nodes, to which step 4 limits
             the variances there; None where nodes are not recorded.
+        change: of the last iteration, largest of all means, in standard deviations.
     """
 
+    initial_time: jax.Array
     since: jax.Array
     length: jax.Array
     points: LinearisationPoints
     variance_share: jax.Array | None
+    change: jax.Array
 
     def on_grid(self, grid: TimeGrid, is_own: bool = False) -> Anchor:
         """Return the moments at the nodes of another time grid, interpolated within the intervals.
@@ -81,23 +85,26 @@ class Anchor(NamedTuple):
         if is_own and grid.lengths is not None and (count, steps) == (np.shape(grid.intervals.length)[0], grid.steps):
             return self
         since, length = jnp.asarray(grid.since), jnp.asarray(grid.intervals.length)
-        # The interval of the anchor in which an interval of the grid lies: a jump is at its end.
-        row = jnp.searchsorted(self.since + self.length, since + 0.5 * length)
-        row = jnp.minimum(row, count - 1)
-        fractions = jnp.linspace(0.0, 1.0, grid.steps + 1)
-        position = (since - self.since[row])[:, None] + length[:, None] * fractions
-        own_length = self.length[row][:, None]
-        is_empty = own_length <= 0.0
-        position = steps * jnp.clip(position / jnp.where(is_empty, 1.0, own_length), 0.0, 1.0)
+        node_times = (since + grid.initial_time - self.initial_time)[:, None] + (
+            length[:, None] * jnp.linspace(0.0, 1.0, grid.steps + 1))
+        # The interval of the anchor in which a node lies. Moments jump at its end, and the first node is after a jump.
+        ends, rounding = self.since + self.length, 1e-9 * length[:, None]
+        first, others = (jnp.searchsorted(ends, times) for times in (
+            node_times[:, :1] + rounding, node_times[:, 1:] - rounding))
+        row = jnp.minimum(jnp.concatenate([jnp.minimum(first, others[:, :1]), others], axis=1), count - 1)
+        own_length = self.length[row]
+        position = (node_times - self.since[row]) / jnp.where(own_length > 0.0, own_length, 1.0)
+        position = steps * jnp.clip(position, 0.0, 1.0)
         lower = jnp.minimum(position.astype(int), steps - 1)
 
         def interpolate(a: jax.Array) -> jax.Array:
             weight = (position - lower).reshape(position.shape + (1,) * (a.ndim - 2))
-            return (1.0 - weight) * a[row[:, None], lower] + weight * a[row[:, None], lower + 1]
+            return (1.0 - weight) * a[row, lower] + weight * a[row, lower + 1]
 
         nodes, share = jax.tree.map(interpolate, (self.points.nodes, self.variance_share))
-        end_moments = jax.tree.map(lambda a: a[row], self.points.end_moments)
-        return Anchor(since, length, LinearisationPoints(nodes, end_moments), share)
+        end_moments = jax.tree.map(lambda a: a[row[:, -1]], self.points.end_moments)
+        return Anchor(jnp.asarray(grid.initial_time, float), since, length, LinearisationPoints(nodes, end_moments),
+                      share, self.change)
 
 
 class IterationResult(NamedTuple):
@@ -217,13 +224,15 @@ def converged_anchor(problem: FilterProblem, updater: Updater, damping: float, a
         return count + 1, _iterate(problem, updater, damping, state, largest, share)
 
     _, state = jax.lax.while_loop(is_moving, iterate, (jnp.asarray(0), state))
-    grid = jnp.asarray(problem.grid.since, float), jnp.asarray(problem.grid.intervals.length, float)
+    initial_time, since, length = (jnp.asarray(part, float) for part in (
+        problem.grid.initial_time, problem.grid.since, problem.grid.intervals.length))
     if anchor is not None or largest is None:
-        return Anchor(*grid, state.points, share)
+        return Anchor(initial_time, since, length, state.points, share, state.change)
     predicted = predicted_variance(problem, forward(problem, updater, about=state.points, record=Record.LINEARIZATION))
     assert predicted is not None
     is_known = predicted <= 0.0
-    return Anchor(*grid, state.points, jnp.where(is_known, 1.0, largest / jnp.where(is_known, 1.0, predicted)))
+    share = jnp.where(is_known, 1.0, largest / jnp.where(is_known, 1.0, predicted))
+    return Anchor(initial_time, since, length, state.points, share, state.change)
 
 
 def _check_states(problem: FilterProblem, anchor: Anchor) -> None:

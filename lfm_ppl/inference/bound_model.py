@@ -42,6 +42,9 @@ _FORWARD_MODE_LIMIT = 3
 _SITEWISE_STRATEGIES = (init_to_median, init_to_sample)
 """Initialisation strategies that depend on a site alone, so that they can be compiled."""
 
+_LARGEST_CHANGE_OF_ANCHOR = 1e-6
+"""Change of the means of an anchor in its last iteration, in standard deviations, above which it has not settled."""
+
 _PROBE_DISTANCE = 0.1
 """Distance of the second probe from the prior medians, in each unconstrained coordinate."""
 
@@ -517,8 +520,9 @@ class BoundModel:
     def anchored(self, z: ArrayLike, sites: Collection[str] | None = None) -> BoundModel:
         """Return the same model whose iterations start from the converged smoothed moments at z (d,), see `anchor`.
 
-        They do so where these moments are finite, also for other data and settings. The moments are arguments of all
-        programs.
+        They do so where these moments have settled, also for other data and settings. The moments are arguments of all
+        programs. A likelihood inside of a mask or an expansion, and one whose known inputs or events are at times that
+        depend on the parameters, start from the filter's moments.
 
         Args:
             z: (d,).
@@ -526,14 +530,21 @@ class BoundModel:
         """
         anchors = {name: model.anchor(z) for name, model in self.site_models.items()
                    if (model.site.example.settings.iterations > 0 and model.site.example.is_iterated
-                       if sites is None else name in sites)}
+                       and self._has_fixed_grid(name) if sites is None else name in sites)}
         finite = {name: anchor for name, anchor in anchors.items()
-                  if all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(anchor))}
+                  if all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(anchor))
+                  and np.max(anchor.change) < _LARGEST_CHANGE_OF_ANCHOR}
         if not finite:
             return self
         bound = self._copy(self.constants.with_anchors(finite), self.problem.with_anchors(finite), self._selected)
         bound.anchor_point = np.asarray(z, float)
         return bound
+
+    def _has_fixed_grid(self, site: str) -> bool:
+        """Whether no time of the grid of a likelihood depends on the parameters, as far as that is known."""
+        layout = self.problem.grids[site].layout if site in self.problem.grids else None
+        is_wrapped = not isinstance(self.traced.at_medians[site]["fn"], Likelihood)
+        return not is_wrapped and not (layout is not None and any(layout.is_lagged + layout.is_event_lagged))
 
     def with_all_sites(self) -> BoundModel:
         """Return the same model with no likelihood site selected."""

@@ -67,11 +67,13 @@ def tune_iterations(key: jax.Array, bound: BoundModel, laplace: Laplace) -> dict
     """
     normals = np.asarray(jax.random.normal(key, (_DRAWS, bound.size)))
     draws = laplace.mode + normals @ np.linalg.cholesky(laplace.covariance).T
-    return {name: _tune_site(model, draws) for name, model in bound.site_models.items()
-            if name in bound.problem.anchors and "iterations" not in model.site.example.given}
+    tunings = {name: _tune_site(model, draws) for name, model in bound.site_models.items()
+               if name in bound.problem.anchors and "iterations" not in model.site.example.given}
+    return {name: tuning for name, tuning in tunings.items() if tuning is not None}
 
 
-def _tune_site(bound: BoundModel, draws: np.ndarray) -> Tuning:
+def _tune_site(bound: BoundModel, draws: np.ndarray) -> Tuning | None:
+    """Return the settings of a site; None where the filter breaks down at most draws."""
     def log_likelihoods(draws: jax.Array, iterations: jax.Array, problem: Problem) -> jax.Array:
         def log_likelihood(z: jax.Array) -> jax.Array:
             def of_series(series: SeriesLikelihood, y: Any) -> jax.Array:
@@ -83,9 +85,12 @@ def _tune_site(bound: BoundModel, draws: np.ndarray) -> Tuning:
 
     run = bound.program("log likelihoods after iterations", lambda: Program(log_likelihoods))
     finest = np.asarray(run(jnp.asarray(draws), jnp.asarray(_FINEST), bound.problem))
+    is_possible = np.isfinite(finest)  # the approximation may reach where the filter breaks down
+    if 2 * is_possible.sum() < len(draws):
+        return None
     for count in _COUNTS:
         values = np.asarray(run(jnp.asarray(draws), jnp.asarray(count), bound.problem))
-        error = finite_sd(values - finest)
+        error = finite_sd(values[is_possible] - finest[is_possible])
         if error <= TOLERATED_ERROR:
             break
     return Tuning(count, error)

@@ -23,8 +23,8 @@ _ROUNDING = 1e-9
 def even_forces(model: LatentForceModel, times: Any) -> list[str]:
     """Return the names of forces of which dynamics and observation are even functions, about the prior mean.
 
-    They are compared at one standard deviation above and below the mean of a force, at the initial mean of the state
-    and of the other forces. A function that does not depend on the force there is not called even.
+    They are compared at one standard deviation above and below the mean of a force, at the first, a middle and the last
+    time, and at three states about the initial mean: a force that a product with the state shows is not even.
 
     Args:
         model: the latent force model.
@@ -37,24 +37,37 @@ def even_forces(model: LatentForceModel, times: Any) -> list[str]:
         return []
     start = np.asarray(times, float).flat[0] if model.initial_time is None else model.initial_time
     stack, state = Stack(model.force_list), jnp.asarray(model.initial_state.mean, float)
-    mean, measurement = stack.mean_at(start), stack.measurement(start)
+    measurement = stack.measurement(start)
     sds = jnp.sqrt(jnp.diagonal(measurement @ stack.initial_covariance() @ measurement.T))
+    size = jnp.sqrt(jnp.diagonal(jnp.asarray(model.initial_state.covariance, float))) + jnp.abs(state) + 1.0
+    pattern = jnp.where(np.arange(len(size)) % 2, -0.7, 1.0)
+    observed = np.sort(np.ravel(np.asarray(times, float)))
+    points = [(state + share * size * pattern, stack.mean_at(t), t) for share, t in zip(
+        (0.0, 0.3, -0.2), (start, observed[len(observed) // 2], observed[-1]), strict=True)]
 
-    def values(forces: Any) -> jax.Array:
-        return jnp.concatenate([jnp.ravel(model.drift(state, forces, start)),
-                                jnp.ravel(model.observation.function(state, forces, start))])
+    def values(state: jax.Array, forces: jax.Array, t: Any) -> jax.Array:
+        return jnp.concatenate([jnp.ravel(model.drift(state, forces, t)),
+                                jnp.ravel(model.observation.function(state, forces, t))])
 
-    centre = values(mean)
-    if checks.traced(centre):  # in compiled code, or by a variable that a function reads
+    def sizes_of_parts(index: int) -> np.ndarray:
+        """Return the sizes (3, 3) of the even part, of the odd part and of the value, at each point."""
+        sizes = []
+        for state, forces, t in points:
+            above, below = (values(state, forces.at[index].add(sign * sds[index]), t) for sign in (1.0, -1.0))
+            centre = values(state, forces, t)
+            sizes.append([float(jnp.abs(part).max(initial=0.0))
+                          for part in (above + below - 2.0 * centre, above - below, centre)])
+        return np.array(sizes)
+
+    def is_even(index: int) -> bool:
+        sizes = sizes_of_parts(index)
+        even, odd, value = sizes.max(axis=0)
+        # Rounding of the value is no dependence.
+        return bool(np.isfinite(sizes).all() and even > _ROUNDING * value and odd <= _ROUNDING * even)
+
+    if checks.traced(values(*points[0])):  # in compiled code, or by a variable that a function reads
         return []
-    rounding, names = _ROUNDING * float(jnp.abs(centre).max(initial=0.0)), []
-    for index, name in enumerate(model.force_names):
-        above, below = (values(mean.at[index].add(sign * sds[index])) for sign in (1.0, -1.0))
-        size = float(jnp.abs(above + below - 2.0 * centre).max(initial=0.0))
-        # Rounding of the centre is no dependence.
-        if size > rounding and float(jnp.abs(above - below).max(initial=0.0)) <= _ROUNDING * size:
-            names.append(name)
-    return names
+    return [name for index, name in enumerate(model.force_names) if is_even(index)]
 
 
 def even_force_message(name: str) -> str:

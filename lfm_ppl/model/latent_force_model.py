@@ -194,8 +194,8 @@ class LatentForceModel(eqx.Module):
         (outputs,) = functions["observation"].shape.shape
         shape = jax.eval_shape(observation.covariance_at, *arguments, 0).shape
         if shape != (outputs, outputs):
-            raise ValueError(f"the observation has {outputs} components, so its covariance must be ({outputs},) or "
-                             f"({outputs}, {outputs}); it is {shape}.")
+            raise ValueError(f"the observation has {outputs} components, so its sd must be a number or ({outputs},), "
+                             f"or its covariance ({outputs},) or ({outputs}, {outputs}); the covariance is {shape}.")
         if any(not 0 <= index < outputs for index in observation.angular):
             raise ValueError(f"angular indices must lie in 0..{outputs - 1}, got {observation.angular}.")
         if callable(observation.covariance):
@@ -259,8 +259,8 @@ class LatentForceModel(eqx.Module):
             self.observation.check_rows(rows)
         covariance = self.observation.covariance
         if np.ndim(covariance) == 3 and np.shape(covariance)[0] != rows:
-            raise ValueError(f"the observation covariance holds {np.shape(covariance)[0]} matrices, one for each time, "
-                             f"but there are {rows} times.")
+            raise ValueError(f"the sd or covariance of the observation has {np.shape(covariance)[0]} rows, one for "
+                             f"each time, but there are {rows} times.")
         self._check_precision()
         self._check_finite(time)
 

@@ -102,7 +102,7 @@ def check_noise(ssm: StateSpaceModel, time: Any) -> None:
     for name, sd in zip(ssm.model.output_names, scale.min(axis=0), strict=True):
         if sd == 0.0:
             raise ValueError(f"the observation noise of {name!r} is zero, so that an observation has no density given "
-                             "the state. Give it a positive variance.")
+                             "the state. Give it a positive sd.")
     smallest = np.linalg.eigvalsh(covariance / (scale[:, :, None] * scale[:, None, :])).min(axis=1)
     if smallest.min() < 1e-13:
         raise ValueError("the covariance of the observation noise is singular, so that an observation has no density "

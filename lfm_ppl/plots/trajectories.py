@@ -401,7 +401,7 @@ def _band(view: ResultView, kind: str, name: str) -> tuple[np.ndarray, np.ndarra
 
 
 def _summary(view: ResultView, name: str) -> xr.DataArray | None:
-    """Return the summary (statistic, at, ...) of trajectories; None where there are draws alone."""
+    """Return the summary (statistic, time, ...) of trajectories; None where there are draws alone."""
     summary = view.group("trajectories").get(f"{name}_summary")
     return None if summary is None else summary.transpose("statistic", "time", ...)
 

@@ -30,7 +30,7 @@ SERIES = "series"
 """Dimension of the series where a plate has no usable name; a second name of it in ``coords`` of `lfm_ppl.fit`."""
 
 TIMES = "times"
-"""Coordinate (series, time) or (series, at) of series that have times of their own."""
+"""Coordinate (series, time) of series that have times of their own."""
 
 _NOT_OF_SERIES = ("accuracy",)
 """Groups about the panel as a whole."""

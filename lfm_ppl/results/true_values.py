@@ -130,7 +130,8 @@ def truth_dataset(truth: Mapping[str, Any], named: dict, units: Mapping[str, str
         if label not in posterior:
             continue
         dims = posterior[label].dims[2:]
-        if value.shape == posterior[label].shape[2:]:
+        # A parameter along the rows of the data has another time than the true path.
+        if value.shape == posterior[label].shape[2:] and "time" not in dims:
             variables[label] = (dims, value)
             coords |= {name: posterior[name].values for name in dims}
         else:

@@ -309,8 +309,8 @@ def fit(
     if progress:
         print(f"likelihood: {description['likelihood']}", file=sys.stderr, flush=True)
         if method_of_chains == "sequential" and chain_method is None and jax.default_backend() == "cpu":
-            print(f"The {chains} chains run one after another, because JAX computed before this fit: call "
-                  f"numpyro.set_host_device_count({chains}) at the beginning for chains side by side.",
+            print(f"The {chains} chains run one after another: JAX has {jax.local_device_count()} of the devices for "
+                  f"{chains} chains side by side. Call numpyro.set_host_device_count({chains}) before it computes.",
                   file=sys.stderr, flush=True)
     with contextlib.closing(store) if store else contextlib.nullcontext(), calendar_time.in_messages(*clock):
         with _explain_start_failure(bound):

@@ -31,7 +31,7 @@ from lfm_ppl.workflows.fit import fit
 from lfm_ppl.workflows.fit_tasks import FitDataSet, fit_task
 
 _GROUPS = "posterior", "sample_stats", "truth"
-_SHARED_ATTRIBUTES = ("model", "rule", "steps", "max_step", "iterations", "tolerance", "method", "sampler", "chains",
+_SHARED_ATTRIBUTES = ("model", "rule", "steps", "max_step", "tolerance", "method", "sampler", "chains",
                       "warmup", "samples", "thin", "versions")
 """Groups and attributes of the object of all data sets."""
 

@@ -152,7 +152,7 @@ def _find_random_walk_start(bound: BoundModel, options: FitOptions, setup: Mappi
         if options.sampler == "pmmh":
             # The start of a chain may be far from the posterior, where the variance of the estimate is another one.
             sampler_options.setdefault("tune_at", bound.unravel(mode.mode))
-        elif options.init is None and mode.converged and not has_second_mode(mode):
+        elif options.init in (None, "map") and mode.converged and not has_second_mode(mode):
             bound, tunings = anchor_at_mode(options.keys["tuning"], bound, Laplace(mode.mode, mode.start_covariance))
     kernel = kernel_type(bound.model, **sampler_options)
     if mode is None or options.init is not None:

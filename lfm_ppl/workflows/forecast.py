@@ -297,8 +297,11 @@ def _forecast(key: jax.Array, view: ResultView, problem: ModelDraws, times: np.n
                  for name, value in paths.items()}
     split = {name: value.reshape(chains, len(draw_index), *value.shape[1:]) for name, value in paths.items()}
     log_likelihood = split.pop("log_likelihood", None)
-    # The log likelihood of an observation family depends on the times of the forecast in its last digits.
-    if log_likelihood is not None and not bound.site.example.is_family:
+    # The log likelihood of an observation family depends on the times of the forecast in its last digits, and one that
+    # starts from an anchor on those within the data, at which the moments are interpolated.
+    is_within_data = np.min(times) < np.max(rebuilding.observations(view)[0])
+    is_same = not bound.site.example.is_family and (bound.anchor_point is None or not is_within_data)
+    if log_likelihood is not None and is_same:
         total = log_likelihood.reshape(chains, len(draw_index), -1).sum(axis=-1)
         rebuilding.check_likelihood(view, total, draw_index)
     observed, series = view.group("data"), view.series_dimension

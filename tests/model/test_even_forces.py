@@ -33,6 +33,9 @@ SEEN = {
     "softplus": model_of(lambda x, u, t: jax.nn.softplus(u[:1]) + u[1:] - x),
     "square about a mean": model_of(lambda x, u, t: u[:1] ** 2 + u[1:] - x, lfm.Matern(1.0, 1.0, mean=0.5)),
     "bilinear": model_of(lambda x, u, t: u[:1] * x + u[1:] - x),
+    "drag in a wind, from rest": model_of(lambda x, u, t: 1.0 - jnp.abs(x - u[:1]) * (x - u[:1]) + u[1:]),
+    "square of a difference": model_of(lambda x, u, t: 9.8 - (x - u[:1]) ** 2 + u[1:]),
+    "visible later": model_of(lambda x, u, t: jnp.maximum(t - 1.0, 0.0) * u[:1] + u[:1] ** 2 + u[1:] - x),
     "square, but observed": model_of(lambda x, u, t: u[:1] ** 2 + u[1:] - x, observed=lambda x, u, t: x + u[:1]),
 }
 
