@@ -480,7 +480,7 @@ def test_a_fit_has_paths_of_regimes_and_forecasts():
     result = lfm.fit(regimes_model, times, y, sampler="map", samples=100, progress=False)
     states = result["trajectories"]["states"]
     assert list(states["state"].values) == ["x0", "calm", "rough"]
-    probability = states.sel(state="rough", at=times).mean(("chain", "draw"))
+    probability = states.sel(state="rough", time=times).mean(("chain", "draw"))
     assert np.isin(states.sel(state=["calm", "rough"]), [0.0, 1.0]).all()
     assert np.mean((probability > 0.5) == np.asarray(w[:, 2], bool)) > 0.75
     forecast = lfm.forecast(result, regimes_model, np.linspace(20.0, 40.0, 5), progress=False)
