@@ -37,6 +37,10 @@ gc.set_threshold(50_000, 20, 50)
 os.environ["LFM_PPL_CACHE"] = "off"  # the command line keeps nothing in the home of who runs the tests
 
 
+EVERY_CASE = ("test_contract.py", "test_code_blocks.py", "test_docs.py", "test_docstrings.py")
+"""Modules all of whose cases run by default."""
+
+
 def _asked_for(config: pytest.Config, mark: str) -> bool:
     return mark in config.option.markexpr and f"not {mark}" not in config.option.markexpr
 
@@ -51,6 +55,19 @@ def pytest_configure(config: pytest.Config) -> None:
         return
     _keep_to_one_cpu(os.environ.get("PYTEST_XDIST_WORKER", ""))
     quick_compilation(3 if _asked_for(config, "slow") else 0)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark all but the first case of a parametrised test as thorough; a model, a page or an example is no variation."""
+    tested = set()
+    for item in items:
+        name = item.nodeid.partition("[")[0]
+        is_first = name not in tested or item.path.name in EVERY_CASE
+        if is_first and not any(item.get_closest_marker(mark) for mark in ("slow", "performance", "thorough")):
+            tested.add(name)
+        elif not is_first:
+            item.add_marker(pytest.mark.thorough)
 
 
 def _keep_to_one_cpu(worker: str) -> None:

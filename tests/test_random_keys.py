@@ -78,6 +78,7 @@ def check_keys(monkeypatch, compute):
     assert len(record.consumers) > 2
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", COMPUTATIONS)
 def test_no_key_is_used_twice(name, monkeypatch):

@@ -145,6 +145,7 @@ def _of_known_numbers(spec: Structure, data: Series, result: dict) -> list[str]:
     return [] if difference <= 1e-6 * max(1.0, abs(float(eager))) else [f"known numbers and traced: {difference:.1e}"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [pytest.param(285, marks=pytest.mark.slow), 16])
 def test_a_few_structures(seed):
     """One with a force that jumps and a curved output, and one that is linear."""

@@ -73,6 +73,7 @@ def test_moments_bands_and_draws(dense, upper):
         np.testing.assert_allclose(np.corrcoef(ours.T), np.corrcoef(reference.T), atol=1.5 * error)
 
 
+@pytest.mark.thorough
 def test_without_active_constraints_it_is_the_smoother():
     posterior = lfm.constrained_posterior(model(), TIMES, Y, lower={"factor": -30.0}, grid=TIMES)
     smoothed = lfm.smooth(model(), TIMES, Y)

@@ -58,6 +58,7 @@ def test_two_compartments_superpose():
     np.testing.assert_allclose(lfm.smooth(model, TIMES, ONES).mean, exact.real.T, atol=1e-10)
 
 
+@pytest.mark.thorough
 def test_doses_with_saturated_elimination_follow_the_ode():
     def rates(x, xp=jnp):
         return xp.stack([-1.3 * x[0], 1.3 * x[0] - 1.5 * x[1] / (0.8 + x[1])])
@@ -108,6 +109,7 @@ def flow_meter(t, noise, observation_first=True):
         events=[lfm.Reset(t, "meter", observation_first=observation_first)])
 
 
+@pytest.mark.thorough
 def test_sums_between_reports_equal_dense_algebra():
     t, y, noise, sums, cross = interval_sums()
     model = flow_meter(t, noise)
@@ -354,6 +356,7 @@ def test_wrong_arguments_of_events_are_refused():
         absorption(1.0, 0.5, [(1.0, 2.0)])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("negative_binomial", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_counts_of_a_state_that_is_zero_at_a_row(negative_binomial):
     """The integral of an unknown constant rate, from zero at the first row on: log evidence and gradient by quadrature.

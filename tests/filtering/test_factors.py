@@ -120,6 +120,7 @@ def evidence_and_moments(name, y):
     return distribution.log_prob(y), *result.force("u"), jnp.cov(draws.T)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [name if name == "Poisson" else pytest.param(name, marks=pytest.mark.slow)
                                   for name in FAMILIES])
 def test_evidence_and_posterior_against_importance_sampling(name):
@@ -172,6 +173,7 @@ def differences(value, theta, h=1e-3):
             / (12 * h) for e in np.eye(theta.size)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name, factors", [
     ("Student-t", None),
     *(pytest.param(name, None, marks=pytest.mark.slow) for name in ("Poisson", "negative binomial", "Bernoulli")),
@@ -311,6 +313,7 @@ def test_evidence_of_counts_of_any_size(link):
     np.testing.assert_allclose(slope * sd, (above - below) / (2 * step), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_a_series_of_large_counts():
     """Two scales of counts of one force: the evidence of 1e8 counts is that of Gaussian logarithms, to O(1e-8)."""
     times, rng = np.linspace(0.0, 3.0, 8), np.random.default_rng(0)

@@ -132,6 +132,7 @@ def case(request):
     return settings, results
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rate", RATES)
 def test_rates_slow_and_fast(case, rate):
     settings, results = case
@@ -195,6 +196,7 @@ def test_draws_of_a_state_without_noise_are_the_exact_path():
     np.testing.assert_allclose(draws, np.tile(20.0 * concentration(10.0), (3, 1)), rtol=1e-10)
 
 
+@pytest.mark.thorough
 def test_a_dose_and_a_panel():
     """The dose decays beside the infusion; both series of the panel have their own rate."""
     def build(parameters):

@@ -82,6 +82,7 @@ ALL = [*(("softplus", edge) for edge in EDGES), *(
     for edge in edges)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name, edge", ALL)
 def test_gradient_equals_central_differences(compiled, name, edge):
     theta, y = (EDGES | OSCILLATORS)[edge]

@@ -149,6 +149,7 @@ def lagged(lag, **keywords):
 LAGS = np.array([0.31, 1.2, 1.37, 1.43, 2.0 - 1e-9, 2.0 + 1e-9, 3.7])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("keywords", [{}, pytest.param({"tolerance": 1e-3}, marks=pytest.mark.slow)])
 def test_value_and_derivative_with_respect_to_a_lag(keywords):
     value, gradient = jax.jit(jax.vmap(jax.value_and_grad(lambda lag: lagged(lag, **keywords))))(LAGS)

@@ -37,6 +37,7 @@ def test_stored_transitions_equal_tabulated_ones(monkeypatch, block):
     np.testing.assert_allclose(gradient, differences, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_derivatives_with_respect_to_times():
     gradient = jax.grad(log_prob, argnums=1)(jnp.array([1.3, 0.4, 0.8]), jnp.asarray(TIMES))
     change = 1e-5 * np.eye(21)[7]

@@ -146,6 +146,7 @@ def test_a_single_pass_is_the_default_of_a_linear_model_and_with_a_tolerance(mod
     np.testing.assert_allclose(result.log_likelihood, lfm.filter(model, TIMES, Y, **settings).log_likelihood, rtol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", [
     double_well(), pytest.param(motif(softplus, genes=1), marks=pytest.mark.slow),
     pytest.param(curved_observation(), marks=pytest.mark.slow),
@@ -166,6 +167,7 @@ def test_moments_at_the_same_parameters_are_a_fixed_point(model):
     assert change < 1e-7
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("well", "y"), [BREAKING[0], pytest.param(*BREAKING[1], marks=pytest.mark.slow)])
 def test_moments_to_start_from_have_limited_variances(well, y):
     """At their own parameters, and at others, where the limit follows the variances that a pass predicts."""
@@ -183,6 +185,7 @@ def test_moments_to_start_from_have_limited_variances(well, y):
     assert abs(run(other, about) - exact_log_likelihood(other, np.array(y)[:, 0])) < 1.2
 
 
+@pytest.mark.thorough
 def test_gradients_hold_the_moments_to_start_from_fixed():
     well = Well(2.0, 0.7, 0.05, 0.5, 0.9, 0.2)
     times, y = well.spacing * np.arange(1, 7), jnp.array([0.8, 1.1, 0.7, 0.2, -0.4, -0.9])[:, None]

@@ -25,6 +25,7 @@ def genes(link, variance=0.0, integrated=False):
         lfm.Gaussian(jnp.array([0.1, 0.04, 0.07]), variance * jnp.eye(3)), initial_time=0.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("variance", [
     0.0, pytest.param(1e-12, marks=pytest.mark.slow), pytest.param(1e8, marks=pytest.mark.slow)])
 def test_between_nodes_it_is_the_exact_smoother(variance):

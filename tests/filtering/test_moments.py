@@ -42,6 +42,7 @@ def predicted(model, rule, count):
     return np.append(result.predicted_mean[-1], result.predicted_covariance[-1].ravel())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [
     pytest.param(name, marks=() if name in ("Taylor", "GaussHermite(3)") else pytest.mark.slow) for name in RULES])
 @pytest.mark.parametrize("variance", [0.2, 0.0])

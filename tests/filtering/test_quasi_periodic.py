@@ -56,6 +56,7 @@ def dense(evolution):
     return Regression(process, np.eye(1, 2), np.array([0.1]))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("evolution", [
     pytest.param(name, marks=() if name == "SQM" else pytest.mark.slow) for name in EVOLUTIONS])
 def test_a_driven_state_is_that_of_dense_algebra(evolution):
@@ -143,6 +144,7 @@ def test_forces_on_a_grid_may_jump():
     np.testing.assert_allclose(prior, exact("SQM")(latent.grid[:, None], latent.grid), atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_a_period_longer_than_the_data_is_an_error():
     late = model(lfm.Periodic(kernel(period=24.0), functions=3) + lfm.Constant(1.0))
     with pytest.raises(ValueError, match="'u'.* 24"):

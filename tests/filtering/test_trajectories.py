@@ -58,6 +58,7 @@ def check(link, genes, variance, steps, iterations, requested_times=AT, noise_sd
         lfm.smooth(model, TIMES, observed(genes, link), steps=steps, iterations=iterations, at=requested_times))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("link", "genes", "variance", "steps", "iterations"), [
     (identity, 5, 0.0, 10, 0), pytest.param(softplus, 2, 1e-10, 3, 3, marks=pytest.mark.slow),
     pytest.param(identity, 1, 1e8, 10, 0, marks=pytest.mark.slow),

@@ -59,6 +59,7 @@ TYPES = [
 ]
 
 
+@pytest.mark.thorough
 def test_wrong_arguments_are_named():
     for error, cases in ((ValueError, VALUES), (TypeError, TYPES)):
         for make, name in cases:

@@ -78,6 +78,7 @@ def test_the_error_is_the_spectral_mass_left_out(order, functions=9):
     assert error[0] == pytest.approx(1.0 - float(force.eigenvalues().sum()), abs=1e-13)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("order", "largest"), [
     ("se", 0.01), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((2, 0.01), (1, 0.015), (0, 0.064)))])
 def test_the_default_is_as_good_as_documented(order, largest):
@@ -100,6 +101,7 @@ def test_the_default_is_as_good_as_documented(order, largest):
     assert lfm.Periodic(kernel).functions == significant_functions(kernel) == 3
 
 
+@pytest.mark.thorough
 def test_the_error_goes_to_zero():
     for kernel, gammas, last in ((squared_exponential(0.3), (1e-2, 1e-6, 1e-13), 1e-11),
                                  (forces.PeriodicMatern(1.0, 1.0, 10.0, 0), (1e-2, 1e-3, 1e-5), 2.1e-3)):
@@ -129,6 +131,7 @@ def test_nystrom_is_the_paper_s_formula():
     assert significant_functions(kernel) == (values > 0.01 * values[0]).sum()
 
 
+@pytest.mark.thorough
 def test_both_treatments_agree_where_both_apply():
     kernel = squared_exponential(0.8)
     general = forces.PeriodicKernel(lambda t, s: jnp.exp(-(jnp.sin(jnp.pi * (t - s) / 10.0) / 0.8) ** 2), 10.0)
@@ -251,6 +254,7 @@ def test_a_sum_with_jumps_has_the_covariances_of_its_terms():
     assert_allclose(result, expected, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_the_covariance_of_the_state_space_form_is_that_of_the_basis():
     t = np.array([0.0, 1.2, 7.0, 13.0])
     for kernel in (squared_exponential(), forces.ModeratedPeriodicMatern(1.0, 1.0, 10.0, 0.1)):

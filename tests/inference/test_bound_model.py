@@ -63,6 +63,7 @@ def numpyro_density(model, arguments, z, **keywords):
 VALUES = {"decay": 0.8, "noise_sd": np.array([0.1, 0.2]), "lengthscale": 1.3}
 
 
+@pytest.mark.thorough
 def test_coordinates_are_named_and_values_come_back(bound):
     assert bound.names == ("decay", "lengthscale", "noise_sd[0]", "noise_sd[1]")
     assert bound.size == 4 and "decay" in repr(bound)
@@ -117,6 +118,7 @@ def test_filter_and_smoother_at_a_draw_are_the_librarys_at_times_that_the_model_
     np.testing.assert_allclose(force.sd, smoothed.force("u").sd, atol=1e-10)
 
 
+@pytest.mark.thorough
 def test_the_methods_of_a_bound_model_read_the_model_once():
     run = Mock(side_effect=small)
 
@@ -137,6 +139,7 @@ def test_the_methods_of_a_bound_model_read_the_model_once():
     assert compiled == []
 
 
+@pytest.mark.thorough
 def test_what_decides_the_program_is_never_mixed_up():
     lfm.bind(small, TIMES, Y)
     for times, order in ((TIMES + 1.0, 1), (TIMES, 2)):
@@ -274,6 +277,7 @@ def test_models_that_share_programs_may_have_other_numbers_of_series():
         assert result == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_panel():
     def several(times, y=None):
         decay = numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
@@ -341,6 +345,7 @@ def changed(kind, monkeypatch):
     }[kind]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["closure", *(pytest.param(kind, marks=pytest.mark.thorough) for kind in (
     "helper", "table", "method", "callable", "module"))])
 def test_a_model_is_what_its_function_computes_now(kind, monkeypatch):

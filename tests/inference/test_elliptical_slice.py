@@ -45,6 +45,7 @@ def step(key, state, log_likelihood=peaks):
     return elliptical_slice_step(key_step, state, draw, log_likelihood, MEAN)
 
 
+@pytest.mark.thorough
 def test_a_step_leaves_the_target_as_it_is():
     """Exact draws by inversion of the distribution function, and one step of each."""
     density = np.exp(peaks(GRID) - 0.5 * ((GRID - MEAN) / SD) ** 2)
@@ -355,6 +356,7 @@ def test_a_site_may_depend_on_others_where_it_is_observed():
     assert set(state.z) == {"location"}
 
 
+@pytest.mark.thorough
 def test_vectorised_chains_start_from_given_points_or_draws_of_the_prior():
     keys = jax.random.split(jax.random.key(0), 2)
     with pytest.raises(ValueError, match="-inf"):

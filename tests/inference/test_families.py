@@ -177,6 +177,7 @@ def assert_nearly_all_have_a_density(name, z, run):
     return value, gradient
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name, count", [("Student-t", 25), *(pytest.param(name, 10_000, marks=pytest.mark.slow)
                                                               for name in FAMILIES)])
 def test_draws_of_the_prior_have_a_density_and_a_gradient(name, count):

@@ -73,6 +73,7 @@ def assert_posterior(mcmc, y):
     return mean
 
 
+@pytest.mark.thorough
 def test_draws_have_the_posterior_of_each_data_set_and_depend_on_the_key(sampled):
     _, mcmc, draws = sampled
     mean = assert_posterior(mcmc, Y)

@@ -116,6 +116,7 @@ def test_draws_follow_the_laplace_approximation():
     assert abs(rates.std() - 1 / math.sqrt(A)) < 4 / math.sqrt(2 * A * n)
 
 
+@pytest.mark.thorough
 def test_sites_with_a_constraint_of_another_dimension():
     """Dirichlet-multinomial on the simplex; two unconstrained coordinates for three values."""
 

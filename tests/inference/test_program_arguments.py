@@ -53,6 +53,7 @@ def patient(shift, amount, variance):
         "inputs": {"rate": table}, "R": np.full((6, 1, 1), variance), "units": {"u": "1/h", "time": "h"}}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", [
     pytest.param(infusion, marks=pytest.mark.thorough), lagged, pytest.param(doses, marks=pytest.mark.thorough)])
 def test_other_times_inputs_and_errors_compile_nothing_and_give_their_own_density(model):

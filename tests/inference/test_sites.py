@@ -32,6 +32,7 @@ def test_the_log_density_is_the_sum_of_the_sites():
         np.testing.assert_array_equal(selected.times, TIMES[name])
 
 
+@pytest.mark.thorough
 def test_other_data_of_one_site_or_of_all():
     bound = lfm.bind(joint_model, TIMES, Y)
     other_data = {**Y, "y2": 1.1 * Y["y2"]}

@@ -96,6 +96,7 @@ def two_sites(times, y=None):
                        obs=y[name])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("model", "times", "y"), [
     (panel, TIMES, np.stack([Y, np.abs(Y)])),
     pytest.param(two_sites, {"a": TIMES, "b": TIMES[:5]}, {"a": Y, "b": Y[:5]}, marks=pytest.mark.slow),

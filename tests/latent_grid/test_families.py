@@ -104,6 +104,7 @@ def test_coal_has_the_evidence_of_bayesnewton():
     np.testing.assert_allclose(sd[[0, 50, 100]], [0.24480603, 0.22654376, 0.27578656], atol=5e-7)
 
 
+@pytest.mark.thorough
 def test_a_grid_without_states_is_the_process_itself():
     """Values on the grid have the prior's covariance, and the likelihood is the family's."""
     model, times, y = problem("Poisson")

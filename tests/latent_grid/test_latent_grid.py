@@ -86,6 +86,7 @@ def test_the_state_converges_to_that_of_an_ode_solver(build, forces, quadrature,
     assert np.all(errors[-1] / np.abs(exact).max(axis=0) < (0.1 if order == 1 else 3e-3))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("build, forces", [(genes, 1), pytest.param(oscillator, 2, marks=pytest.mark.slow)])
 def test_the_linear_rule_is_exact_for_a_production_linear_in_each_cell(build, forces):
     """Whatever the width of the cells: four of them, uneven, and a link that is the identity."""
@@ -136,6 +137,7 @@ def test_a_linear_link_has_the_posterior_of_the_kalman_smoother():
     assert np.allclose(sd, np.asarray(exact.force("u").sd)[on_grid], atol=2e-3)
 
 
+@pytest.mark.thorough
 def test_the_likelihood_leaves_out_what_is_missing_and_wraps_angles():
     latent = LatentGrid(oscillator(), TIMES, 61)
     lag = np.abs(latent.grid[:, None] - latent.grid)

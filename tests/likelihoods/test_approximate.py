@@ -104,6 +104,7 @@ def test_settings_of_a_likelihood_are_its_defaults_and_what_was_given():
     assert (updated.settings.steps, updated.settings.iterations, likelihood.settings.steps) == (10, 0, 4)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("likelihood", [
     lfm.MarginalLikelihood(build(1.0), TIMES, steps=3),
     pytest.param(lfm.ConstrainedLikelihood(build(1.0), TIMES, steps=3, lower={"u": -9.0}, draws=0, grid=5),

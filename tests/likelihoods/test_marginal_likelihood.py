@@ -142,6 +142,7 @@ def test_expanded_and_masked_batches(y):
     np.testing.assert_allclose(event, plain.sum(), rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_prior_predictive_has_the_exact_moments():
     draws = 4000
     conditioned = handlers.condition(motif.model, THETA)
@@ -211,6 +212,7 @@ def failures():
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(evaluate))(jnp.array(POSSIBLE + IMPOSSIBLE)))
 
 
+@pytest.mark.thorough
 def test_impossible_parameters_have_minus_infinity_and_zero_gradients(failures):
     value, reverse, forward = (part[len(POSSIBLE):] for part in failures)
     assert np.all(value == -np.inf)

@@ -35,6 +35,7 @@ def test_a_known_start_is_known_in_compiled_code_too():
     assert np.isfinite(mcmc.get_samples()["y_forces"]).all()
 
 
+@pytest.mark.thorough
 def test_predictions_follow_the_forces():
     """Given forces and start the observations scatter about their state with the noise, and nothing else."""
     latent_values = {"decay": jnp.array(0.8), "y_white": 0.3 * jnp.ones((1, 41)), "y_start": jnp.array([0.5])}

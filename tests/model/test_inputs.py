@@ -177,6 +177,7 @@ def test_a_warning_names_the_input():
         lfm.filter(model, ROWS, np.full((4, 1), 0.3), steps=1)
 
 
+@pytest.mark.thorough
 def test_a_forecast_needs_an_input_as_far_as_it_is_asked_for():
     """And not as far as the last of its intervals, which are as long as the intervals of the data."""
     model = pushed(lambda x, u, t: jnp.tanh(x) * lfm.Input([0.0, 3.6], [1.0, 2.0], "linear", outside="error")(t))

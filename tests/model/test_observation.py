@@ -20,6 +20,7 @@ def log_density(**noise):
     return lfm.MarginalLikelihood(model, TIMES).log_prob(Y)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("sd", "covariance"), [
     (0.3, 0.09 * jnp.eye(2)), (0.3, 0.09), (jnp.array([0.1, 0.2]), jnp.array([0.01, 0.04])),
     (ROWS, jnp.stack([jnp.diag(row**2) for row in ROWS])),

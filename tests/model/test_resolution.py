@@ -36,6 +36,7 @@ def true_error(force, times, sd):
     return 0.5 * np.sum(values - 1 - np.log(values)) + 2.0 * np.sqrt(0.5 * np.sum((values - 1) ** 2))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("order", [order if order == 6 else pytest.param(order, marks=pytest.mark.slow)
                                    for order in lfm.SquaredExponential.orders])
 def test_estimate_is_the_true_error(order):
@@ -69,6 +70,7 @@ def test_the_error_is_estimated_through_the_dynamics():
     np.testing.assert_allclose([scaled.error, slow.error], driven.error, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_functions_warn_and_name_the_force():
     coarse, fine = (model(lfm.SquaredExponential(1.0, 0.2, order), 0.01) for order in (4, 8))
     times, y = np.linspace(0.0, 1.0, 50), np.zeros((50, 1))
@@ -81,6 +83,7 @@ def test_functions_warn_and_name_the_force():
             run(fine)
 
 
+@pytest.mark.thorough
 def test_silent_inside_compiled_code_and_for_other_forces():
     times, y = np.linspace(0.0, 1.0, 50), np.zeros((50, 1))
 

@@ -38,6 +38,7 @@ def within_monte_carlo_error(sample, mean, covariance):
     assert np.abs((np.cov(sample.T) - covariance) / error).max() < 4.5
 
 
+@pytest.mark.thorough
 def test_linear_model_has_its_exact_moments(linear):
     """State and force at all times, and y, which adds independent noise to replicates."""
     result, (mean, cov) = linear
@@ -61,6 +62,7 @@ def test_noise_free_motion_converges_with_the_steps():
     assert float(lfm.simulate(jax.random.key(0), model, [2.0]).y[0, 0]) == pytest.approx(end[2000], abs=1e-3)
 
 
+@pytest.mark.thorough
 def test_double_well_settles_into_its_stationary_density():
     """p(x) ~ exp(2 (x^2 / 2 - x^4 / 4) / s^2), by quadrature."""
     s = 1.2
@@ -89,6 +91,7 @@ def test_state_dependent_dispersion_is_ito():
     assert abs((x**2).mean() - second) < 4.5 * np.sqrt((fourth - second**2) / DRAWS)
 
 
+@pytest.mark.thorough
 def test_starts_at_the_initial_time_and_covers_equal_times():
     result = lfm.simulate(jax.random.key(0), motif(softplus, variance=0.0), [0.0, 0.0, 1.0])
     assert np.allclose(result.state[0], 0.3 / (0.8 * np.array([1.0, 1.5]))) and np.array_equal(*result.state[:2])
@@ -105,6 +108,7 @@ def test_a_jump_at_a_row_is_never_lost():
     assert len(np.unique(force_path)) == 40
 
 
+@pytest.mark.thorough
 def test_a_fast_rate_between_sparse_times():
     """The explicit step between two times would be 36 time constants long."""
     gut = lfm.LatentForceModel(
@@ -130,6 +134,7 @@ def test_a_rate_that_no_step_resolves():
     assert x**3 + x - 2 - np.sin(20.0) == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.thorough
 def test_the_law_does_not_depend_on_the_requested_times():
     """Stationary variances of a fast linear SDE, G^2 / (2 rate), with one key for many draws."""
     model = lfm.LatentForceModel(

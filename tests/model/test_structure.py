@@ -39,6 +39,7 @@ def test_transcription():
     assert result == ({"u"}, set(), {"x0", "x1", "x2"})
 
 
+@pytest.mark.thorough
 def test_linear_motif_and_spring():
     assert structure(Motif(jnp.ones(2), jnp.ones(2), 0.1, identity), 2) == (set(), set(), {"x0", "x1", "u"})
     assert structure(Oscillator(1.0, 0.5, 0.0).__class__(2.0, 0.3), 2)[0] == {"x0"}  # the cubic term may be there
@@ -193,6 +194,7 @@ def test_declared_inputs_override():
     assert structure(lambda x, u, t: x * u, 1, nonlinear_inputs=("u",))[:2] == ({"u"}, {"x0"})
 
 
+@pytest.mark.thorough
 def test_a_wrong_declaration_names_the_coordinate():
     with pytest.raises(ValueError, match="leaves out 'u', but the dynamics is not linear in it. Add it, or leave"):
         structure(Motif(jnp.ones(1), jnp.ones(1), 0.1, softplus), 1, nonlinear_inputs=())

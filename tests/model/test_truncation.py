@@ -61,6 +61,7 @@ EVOLUTIONS = {
 IRREGULAR = np.sort(np.random.default_rng(0).uniform(0.0, 100.0, 700))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [name if name == "rough" else pytest.param(name, marks=pytest.mark.slow)
                                   for name in EVOLUTIONS])
 def test_the_estimate_is_the_error_of_dense_algebra(name):
@@ -126,6 +127,7 @@ def test_the_error_is_estimated_through_the_dynamics():
     np.testing.assert_allclose(result.error, error(exact, truncated), rtol=accuracy)
 
 
+@pytest.mark.thorough
 def test_kernels_without_a_spectrum_and_weights_that_jump():
     times = np.arange(0.0, 12.0, 1 / 30)
     kernel = forces.ModeratedPeriodicMatern(1.0, 1.0, 1.0, 0.5, 2)
@@ -141,6 +143,7 @@ def test_kernels_without_a_spectrum_and_weights_that_jump():
         assert 9 < result.functions < 40
 
 
+@pytest.mark.thorough
 def test_silent_where_nothing_is_wrong_or_nothing_can_be_told():
     few = lfm.Periodic(YEARLY, 7)
     with pytest.warns(lfm.ApproximationWarning, match="7 functions"):

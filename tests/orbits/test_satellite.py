@@ -82,6 +82,7 @@ def test_halved_steps_change_nothing(around, monkeypatch):
     assert np.linalg.norm((path - finer)[-1, :3]) < 1e-5  # km, after a day
 
 
+@pytest.mark.thorough
 def test_an_orbit_is_found_again(around):
     """Noise of 1 cm, gaps, and an unknown amplitude of the sunlight."""
     orbit = orbits.Orbit(0.0, START, 93.0, 0.0)

@@ -48,6 +48,7 @@ def test_backward_simulation_of_a_linear_model():
     assert np.abs(ours - np.corrcoef(np.asarray(exact_draws).T)).max() < 5.0 / np.sqrt(750)
 
 
+@pytest.mark.thorough
 def test_ancestor_tracing_of_a_linear_model():
     exact = lfm.smooth(linear(), TIMES, Y)
     result = lfm.particle_smoother(jax.random.key(0), linear(), TIMES, Y, particles=5000, draws=1000,

@@ -58,6 +58,7 @@ def draws_of(*shape):
     return np.exp(0.1 * np.random.default_rng(1).normal(size=(2, 50, *shape)))
 
 
+@pytest.mark.thorough
 def test_a_panel_with_padded_rows_and_a_series_without_data():
     y = Y.copy()
     y[0, 4:], y[1, 2], y[2] = np.nan, np.nan, np.nan

@@ -69,6 +69,7 @@ def test_a_group_that_collapses_is_named_everywhere(y, keywords, tmp_path):
     assert page.index("degenerate in spread") < page.index('id="model"')
 
 
+@pytest.mark.thorough
 def test_a_proper_mode_gives_no_warning(y):
     """The same model in non-centred form."""
     result = fitted(y, centred=False)

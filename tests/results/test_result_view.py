@@ -44,6 +44,7 @@ def test_readers_take_a_view_in_place_of_a_result(result, tmp_path):
     assert ResultView.of(saved).posterior.equals(view.posterior)
 
 
+@pytest.mark.thorough
 def test_the_report_reads_a_result_once(result, tmp_path, monkeypatch):
     conversions = []
     convert = ResultView.of.__func__

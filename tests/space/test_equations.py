@@ -66,6 +66,7 @@ def coefficient_covariances(kind, boundary, dimension, modes=3):
                       for t in TIMES] for w in wavenumbers])
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore::lfm_ppl.ApproximationWarning")
 @pytest.mark.parametrize(("kind", "boundary", "dimension"), [
     ("heat", "dirichlet", 1), ("heat", "neumann", 1), ("heat", "periodic", 1), ("heat", "neumann", 2),

@@ -23,6 +23,7 @@ def observed(field, function=None, **options):
         lfm.Gaussian(jnp.zeros(0), jnp.zeros((0, 0))))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("dimension", [1, 2])
 @pytest.mark.parametrize(("kernel", "reference"), [
     (lfm.Matern(1.4, 0.6, order=1), references.matern(1, 1.4, 0.6)),
@@ -91,6 +92,7 @@ def test_equal_points_of_a_grid_keep_their_order():
         np.testing.assert_allclose(field.root, fields[0].root, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_counts_in_cells_and_times():
     """A log-Gaussian Cox process: the evidence of a few counts against importance sampling from the posterior."""
     points, times, area = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0]]), np.arange(4.0), 0.5

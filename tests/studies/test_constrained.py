@@ -25,6 +25,7 @@ def test_records_follow_their_equation(shape):
     assert residual.std() == pytest.approx(0.025, rel=0.08)
 
 
+@pytest.mark.thorough
 def test_the_shortest_band_of_a_truncated_normal():
     """Of one quantity without a record: N(0.5, 1) and N(2.5, 1) truncated at zero."""
     model = lfm.LatentForceModel(

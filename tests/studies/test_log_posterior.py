@@ -30,6 +30,7 @@ def bound():
     return bind_arguments(model, (SETS[0],), {})
 
 
+@pytest.mark.thorough
 def test_the_densities_are_those_of_the_model_in_the_order_of_the_names(bound):
     names, values = ("decay", "amount"), {"decay": 0.8, "amount": 1.7}
     posterior = LogPosterior(bound, names)

@@ -108,6 +108,7 @@ def test_between_decisions_nothing_is_drawn():
     assert heated.outputs.error()[-1, 0] < 0.3 * plain
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("build", [
     pytest.param(house, id="adds", marks=pytest.mark.slow), pytest.param(leaky, id="changes a rate")])
 def test_an_input_that_never_changes_is_the_filter(build):

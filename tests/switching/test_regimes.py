@@ -121,6 +121,7 @@ def exact_cases():
             "short memory": ({"low": observed_force(0.5), "high": observed_force(2.0)}, RATES, np.arange(8.0))}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("merging", MERGINGS)
 @pytest.mark.parametrize("case", exact_cases())
 def test_the_density_equals_enumeration_where_merging_is_exact(case, merging):
@@ -134,6 +135,7 @@ def test_the_density_equals_enumeration_where_merging_is_exact(case, merging):
     np.testing.assert_allclose(smoothed.probability, exact.probability, atol=0.07)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("merging", "rows"), [("gpb2", 2), *(
     pytest.param(*case, marks=pytest.mark.thorough) for case in (("gpb3", 3), ("gpb4", 4)))])
 def test_short_records_equal_enumeration(merging, rows):
@@ -283,6 +285,7 @@ def test_long_series_are_within_a_tenth_of_many_particles(case, merging):
     assert abs(rao_blackwellised(switching, y, 100_000) - float(switching.log_prob(y))) < 0.1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("merging", [
     MERGINGS[0], *(pytest.param(name, marks=pytest.mark.thorough) for name in MERGINGS[1:])])
 def test_gradients_equal_finite_differences(merging):
@@ -560,6 +563,7 @@ def test_models_of_another_type_are_refused():
         lfm.Switching({"a": counts, "b": counts}, RATES, np.arange(3.0))
 
 
+@pytest.mark.thorough
 def test_transitions_of_rates_that_are_fast_compared_with_the_rows():
     """The stationary distribution in every row, however long the time, with the derivative in a rate."""
     def transitions(rate, lengths):

@@ -164,6 +164,7 @@ def derivatives(factorise, keep, root, live, weights, floor):
     return value(z), grad(z), jax.jacfwd(value)(z), jax.hessian(value)(z), jax.vmap(grad)(jnp.stack([z, -z]))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("keep", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("floor", [[0.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 2.0], [0.3, 0.3, 0.3, 0.3]])
 @pytest.mark.parametrize("dead", [(), (0,), (1, 3), (2,)])
@@ -188,6 +189,7 @@ def test_a_constant_matrix_that_selects_takes_slices(indices):
     assert isinstance(matmul(pick, np.eye(4)), np.ndarray)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("missing", [(), (1,), (0, 2), (0, 1, 2)])
 def test_density_of_what_is_not_missing(missing):
     covariance, residual = definite(3), np.array([0.3, -1.2, 0.7])

@@ -80,6 +80,7 @@ def test_a_nonlinear_model_is_simulated_from_each_origin():
     assert compiled == []
 
 
+@pytest.mark.thorough
 def test_the_reference_is_the_last_season_with_the_spread_of_its_changes():
     y = data()
     y = np.where(np.isnan(y), 0.0, y)

@@ -95,6 +95,7 @@ def test_groups_and_dimensions(nuts):
         assert {variable: dataset[variable].dims for variable in dataset.data_vars} == variables
 
 
+@pytest.mark.thorough
 def test_coordinates_carry_names_times_and_units(nuts, known_fit, y):
     posterior, paths, observed = (group(nuts, name) for name in ("posterior", "trajectories", "data"))
     assert posterior["output"].values.tolist() == ["a", "b"]

@@ -57,6 +57,7 @@ def exact():
     return mean[start:], covariance[start:, start:]
 
 
+@pytest.mark.thorough
 def test_moments_of_a_linear_model_are_exact(forecast, exact):
     mean, covariance = exact
     result = predictions(forecast)

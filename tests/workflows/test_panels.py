@@ -46,6 +46,7 @@ def smoothed(series, times):
     return lfm.smooth(build(RATES[series]), TIMES[series, rows], Y[series, rows], at=times)
 
 
+@pytest.mark.thorough
 def test_the_plate_is_a_dimension_of_every_group(result):
     for name in ("posterior", "data", "one_step_ahead", "trajectories"):
         assert ResultView.of(result).group(name)["patient"].values.tolist() == LABELS, name
