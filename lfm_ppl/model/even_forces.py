@@ -49,12 +49,15 @@ def even_forces(model: LatentForceModel, times: Any) -> list[str]:
         return jnp.concatenate([jnp.ravel(model.drift(state, forces, t)),
                                 jnp.ravel(model.observation.function(state, forces, t))])
 
+    centres = [values(*point) for point in points]
+    if checks.traced(centres):  # in compiled code, or by a variable that a function reads
+        return []
+
     def sizes_of_parts(index: int) -> np.ndarray:
         """Return the sizes (3, 3) of the even part, of the odd part and of the value, at each point."""
         sizes = []
-        for state, forces, t in points:
+        for (state, forces, t), centre in zip(points, centres, strict=True):
             above, below = (values(state, forces.at[index].add(sign * sds[index]), t) for sign in (1.0, -1.0))
-            centre = values(state, forces, t)
             sizes.append([float(jnp.abs(part).max(initial=0.0))
                           for part in (above + below - 2.0 * centre, above - below, centre)])
         return np.array(sizes)
@@ -65,8 +68,6 @@ def even_forces(model: LatentForceModel, times: Any) -> list[str]:
         # Rounding of the value is no dependence.
         return bool(np.isfinite(sizes).all() and even > _ROUNDING * value and odd <= _ROUNDING * even)
 
-    if checks.traced(values(*points[0])):  # in compiled code, or by a variable that a function reads
-        return []
     return [name for index, name in enumerate(model.force_names) if is_even(index)]
 
 
