@@ -536,9 +536,7 @@ class BoundModel:
                   and np.max(anchor.change) < _LARGEST_CHANGE_OF_ANCHOR}
         if not finite:
             return self
-        bound = self._copy(self.constants.with_anchors(finite), self.problem.with_anchors(finite), self._selected)
-        bound.anchor_point = np.asarray(z, float)
-        return bound
+        return self._with_anchors(finite, np.asarray(z, float))
 
     def _has_fixed_grid(self, site: str) -> bool:
         """Whether no time of the grid of a likelihood depends on the parameters, as far as that is known."""
@@ -553,11 +551,13 @@ class BoundModel:
     def _anchored_as(self, bound: BoundModel) -> BoundModel:
         """Return the same model whose iterations start from the moments of another one, at sites of the same names."""
         anchors = bound.problem.anchors
-        if not anchors:
-            return self
-        anchored = self._copy(self.constants.with_anchors(anchors), self.problem.with_anchors(anchors), self._selected)
-        anchored.anchor_point = bound.anchor_point
-        return anchored
+        return self._with_anchors(anchors, bound.anchor_point) if anchors else self
+
+    def _with_anchors(self, anchors: Mapping[str, Anchor], point: np.ndarray | None) -> BoundModel:
+        """Return the same model with the smoothed moments at a point (d,)."""
+        bound = self._copy(self.constants.with_anchors(anchors), self.problem.with_anchors(anchors), self._selected)
+        bound.anchor_point = point
+        return bound
 
     def explicit_steps(self, z: Any, y: Any = None, requested_times: Any = None) -> ExplicitSteps:
         """Return what limits the explicit steps of the filter; series of a panel, or regimes, are a leading axis.
