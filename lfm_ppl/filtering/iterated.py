@@ -88,10 +88,11 @@ class Anchor(NamedTuple):
         node_times = (since + grid.initial_time - self.initial_time)[:, None] + (
             length[:, None] * jnp.linspace(0.0, 1.0, grid.steps + 1))
         # The interval of the anchor in which a node lies. Moments jump at its end, and the first node is after a jump.
-        ends, rounding = self.since + self.length, 1e-9 * length[:, None]
-        first, others = (jnp.searchsorted(ends, times) for times in (
+        end_times, rounding = self.since + self.length, 1e-9 * length[:, None]
+        first_row, later_rows = (jnp.searchsorted(end_times, times) for times in (
             node_times[:, :1] + rounding, node_times[:, 1:] - rounding))
-        row = jnp.minimum(jnp.concatenate([jnp.minimum(first, others[:, :1]), others], axis=1), count - 1)
+        first_row = jnp.minimum(first_row, later_rows[:, :1])
+        row = jnp.minimum(jnp.concatenate([first_row, later_rows], axis=1), count - 1)
         own_length = self.length[row]
         position = (node_times - self.since[row]) / jnp.where(own_length > 0.0, own_length, 1.0)
         position = steps * jnp.clip(position, 0.0, 1.0)
@@ -138,7 +139,7 @@ class _Iterate(NamedTuple):
     change: jax.Array
 
 
-class _State(NamedTuple):
+class _Iterations(NamedTuple):
     """State of the iterations.
 
     Attributes:
@@ -215,11 +216,11 @@ def converged_anchor(problem: FilterProblem, updater: Updater, damping: float, a
     state, largest = _first_state(problem, updater, damping, anchor)
     share = None if anchor is None else anchor.variance_share
 
-    def is_moving(counted: tuple[jax.Array, _State]) -> jax.Array:
+    def is_moving(counted: tuple[jax.Array, _Iterations]) -> jax.Array:
         count, state = counted
         return (count < _MOST_ITERATIONS) & ~(state.change < _SETTLED)
 
-    def iterate(counted: tuple[jax.Array, _State]) -> tuple[jax.Array, _State]:
+    def iterate(counted: tuple[jax.Array, _Iterations]) -> tuple[jax.Array, _Iterations]:
         count, state = counted
         return count + 1, _iterate(problem, updater, damping, state, largest, share)
 
@@ -243,7 +244,7 @@ def _check_states(problem: FilterProblem, anchor: Anchor) -> None:
 
 
 def _first_state(problem: FilterProblem, updater: Updater, damping: float,
-                 anchor: Anchor | None) -> tuple[_State, jax.Array | None]:
+                 anchor: Anchor | None) -> tuple[_Iterations, jax.Array | None]:
     """Return the moments of an anchor, or those after a first pass with the variances that limit all later ones."""
     largest = None
     if anchor is None:
@@ -260,11 +261,11 @@ def _first_state(problem: FilterProblem, updater: Updater, damping: float,
                         jnp.asarray(jnp.nan))
 
     iterates = first(points.nodes), None if points.end_moments is None else first(points.end_moments)
-    return _State(iterates, jnp.asarray(jnp.nan)), largest
+    return _Iterations(iterates, jnp.asarray(jnp.nan)), largest
 
 
-def _iterate(problem: FilterProblem, updater: Updater, damping: float, state: _State, largest: jax.Array | None,
-             variance_share: jax.Array | None) -> _State:
+def _iterate(problem: FilterProblem, updater: Updater, damping: float, state: _Iterations, largest: jax.Array | None,
+             variance_share: jax.Array | None) -> _Iterations:
     """Return the state after one iteration.
 
     Variances at the nodes are at most ``largest``, or the share of those that the pass predicts.
@@ -280,7 +281,7 @@ def _iterate(problem: FilterProblem, updater: Updater, damping: float, state: _S
     if end_moments is not None:
         assert smoothed.end_moments is not None
         end_moments = _damped_update(end_moments, smoothed.end_moments, damping)
-    return _State((nodes, end_moments), trace.log_likelihood.sum())
+    return _Iterations((nodes, end_moments), trace.log_likelihood.sum())
 
 
 def _smoothed(problem: FilterProblem, trace: FilterTrace) -> LinearisationPoints:
