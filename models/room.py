@@ -101,12 +101,12 @@ def simulate(seed: int = 8) -> lfm.Data:
     tables = known_inputs()
     times = tables["heater"][0]
     grid = np.linspace(times[0], times[-1], 10 * (len(times) - 1) + 1)
-    drawn = lfm.simulate(jax.random.key(seed), build(as_functions(tables), **TRUTH), grid)
+    simulation = lfm.simulate(jax.random.key(seed), build(as_functions(tables), **TRUTH), grid)
     return lfm.Data(
         times=grid[::10],
-        y=np.asarray(drawn.y)[::10],
+        y=np.asarray(simulation.y)[::10],
         outputs=OUTPUTS,
         inputs=tables,
         units=UNITS,
-        truth={"times": grid, "forces": drawn.forces, "state": drawn.state, "parameters": TRUTH},
+        truth={"times": grid, "forces": simulation.forces, "state": simulation.state, "parameters": TRUTH},
     )

@@ -206,8 +206,8 @@ true_heat = np.interp(fitted.times, data.truth["times"], np.asarray(data.truth["
 band = result["trajectories"]["forces"].sel(force="heat").interp(time=fitted.times)
 low, high = band.quantile(0.025, ("chain", "draw")).values, band.quantile(0.975, ("chain", "draw")).values
 error = float(np.sqrt(np.mean((band.mean(("chain", "draw")).values - true_heat) ** 2)))
-inside = np.mean((low < true_heat) & (true_heat < high))
-print(f"heat: root mean squared error {error:.2f} K/h; {inside:.0%} of the true values in the 95% band")
+coverage = np.mean((low < true_heat) & (true_heat < high))
+print(f"heat: root mean squared error {error:.2f} K/h; {coverage:.0%} of the true values in the 95% band")
 print("CRPS of the last twelve hours: " + ", ".join(
     f"{table.loc['all', 'crps']:.2f} degC ({name})" for name, table in scores.items()))
 
