@@ -49,7 +49,13 @@ def even_forces(model: LatentForceModel, times: Any) -> list[str]:
         return jnp.concatenate([jnp.ravel(model.drift(state, forces, t)),
                                 jnp.ravel(model.observation.function(state, forces, t))])
 
-    centres = [values(*point) for point in points]
+    # Traced once, so that functions see here what they see in a filter: their own checks of numbers do not run.
+    closed = jax.make_jaxpr(values)(*points[0])
+
+    def evaluate(*point: Any) -> jax.Array:
+        return jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *point)[0]
+
+    centres = [evaluate(*point) for point in points]
     if checks.traced(centres):  # in compiled code, or by a variable that a function reads
         return []
 
@@ -57,7 +63,7 @@ def even_forces(model: LatentForceModel, times: Any) -> list[str]:
         """Return the sizes (3, 3) of the even part, of the odd part and of the value, at each point."""
         sizes = []
         for (state, forces, t), centre in zip(points, centres, strict=True):
-            above, below = (values(state, forces.at[index].add(sign * sds[index]), t) for sign in (1.0, -1.0))
+            above, below = (evaluate(state, forces.at[index].add(sign * sds[index]), t) for sign in (1.0, -1.0))
             sizes.append([float(jnp.abs(part).max(initial=0.0))
                           for part in (above + below - 2.0 * centre, above - below, centre)])
         return np.array(sizes)

@@ -61,7 +61,7 @@ def observed(function, covariance=VARIANCES, **options):
     (ValueError, observed(lambda x, u, t: x[0]), r"observation function must return a vector \(D,\).*a number"),
     (ValueError, observed(lambda x, u, t: [x[0]]), r"observation function must return a vector \(D,\).*a list"),
     (TypeError, observed(lambda x: x), r"observation function must take three arguments, h\(x, u, t\)"),
-    (ValueError, observed(whole_state, jnp.ones(3)), r"2 components.*\(2, 2\); it is \(3, 3\)"),
+    (ValueError, observed(whole_state, jnp.ones(3)), r"2 components.*\(2, 2\); the covariance is \(3, 3\)"),
     (ValueError, observed(whole_state, angular=(2,)), "angular indices must lie in 0..1"),
     (ValueError, observed(lambda x, u, t: jnp.stack([x[0], 1.0 / u[0]])), "observation function .*'y1' is not finite"),
     (ValueError, observed(whole_state, lambda x, u, t: -jnp.ones(2)), "observation covariance .* semi-definite"),
