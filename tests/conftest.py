@@ -37,7 +37,7 @@ gc.set_threshold(50_000, 20, 50)
 os.environ["LFM_PPL_CACHE"] = "off"  # the command line keeps nothing in the home of who runs the tests
 
 
-EVERY_CASE = ("test_contract.py", "test_code_blocks.py", "test_docs.py", "test_docstrings.py")
+EVERY_CASE = ("test_contract.py", "test_code_blocks.py", "test_docs.py")
 """Modules all of whose cases run by default."""
 
 
@@ -59,7 +59,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark all but the first case of a parametrised test as thorough; a model, a page or an example is no variation."""
+    """Mark all but the first case of a parametrised test as thorough; a model or a page is no variation."""
     tested = set()
     for item in items:
         name = item.nodeid.partition("[")[0]

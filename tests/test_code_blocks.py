@@ -111,6 +111,7 @@ def test_python_blocks_use_names_and_arguments_of_the_library(name):
                 assert not unknown, f"{name}, line {line + call.lineno}: lfm.{call.func.attr}"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [
     pytest.param(name, marks=[pytest.mark.slow] if name in COSTLY else []) for name in WITH_PYTHON])
 def test_python_blocks_of_a_page_run_in_order(name, few_draws, page_folder):

@@ -55,6 +55,7 @@ def test_a_masked_entry_is_nan(use):
     np.testing.assert_array_equal(use(y), use(y.filled(np.nan)))
 
 
+@pytest.mark.thorough
 def test_whole_numbers_lists_and_panels_keep_their_mask():
     integers = masked(dtype=int)
     assert lfm.Data(TIMES, integers, ("x",)).y[2:7, 0].tolist()[1:4] == pytest.approx([np.nan] * 3, nan_ok=True)

@@ -114,6 +114,7 @@ def test_the_record_shows_what_is_used_twice(name, monkeypatch):
         assert record.reused()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("steps", [1, 3])
 def test_a_jump_of_a_force_does_not_depend_on_the_process_noise(steps):
     """The first jump, at 1, and the second, at 2, against the increments of the state before them."""

@@ -61,6 +61,7 @@ def test_the_help_shows_the_defaults_of_the_likelihood(run):
         assert f"(default: {default}" in description.partition(" --")[0], name
 
 
+@pytest.mark.thorough
 def test_options_and_commands_that_the_pages_name_exist(run):
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     lines = re.findall(r"lfm-ppl (\w[\w-]*)([^\n`]*)", "\n".join(page.read_text(encoding="utf-8") for page in pages))

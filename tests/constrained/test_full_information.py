@@ -145,6 +145,7 @@ def test_a_known_start_on_its_bound():
     assert estimate.converged and estimate.state("x0").mean[0] == 0.0 and estimate.state_mean.min() >= 0.0
 
 
+@pytest.mark.thorough
 def test_another_data_set_and_other_bounds_compile_nothing(bounded, caplog):
     y = data(3, pushed)
     lfm.full_information(MODEL, TIMES, y, lower={"factor": 0.0}, upper={"x0": 0.12, "factor": 0.8}, grid=TIMES)

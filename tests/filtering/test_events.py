@@ -32,6 +32,7 @@ def bateman(t, ka, ke):
     return np.where(t > 0, ka / (ka - ke) * (np.exp(-ke * t) - np.exp(-ka * t)), 0.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("lag", [pytest.param(0.0, marks=pytest.mark.thorough), 0.75])
 def test_doses_of_a_linear_model_superpose(lag):
     ka, ke = 1.3, 0.2
@@ -267,6 +268,7 @@ def test_iterated_linearisation_finds_the_most_probable_trajectory():
     np.testing.assert_allclose(estimate.state_mean, smoothed.mean[:, :2], atol=2e-3)
 
 
+@pytest.mark.thorough
 def test_a_continued_filter_equals_one_pass():
     events = [lfm.Dose(DOSES, AMOUNTS, "gut"), lfm.Dose([12.0], 1.0, "blood", observation_first=False)]
     model = absorption(1.3, 0.2, events, forces={"f": lfm.Matern(0.3, 4.0)})

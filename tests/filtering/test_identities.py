@@ -67,6 +67,7 @@ def test_replicates_in_any_order(model):
     assert_same(ordered.leave_one_out[jnp.array(order)], permuted.leave_one_out, 1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("link, error", [(identity, 1e-8), pytest.param(softplus, 2e-3, marks=pytest.mark.slow)])
 def test_requested_times_change_nothing_elsewhere(link, error):
     """Requested times divide the steps, so that a model that is not linear changes by the error of its integration."""

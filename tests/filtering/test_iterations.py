@@ -204,6 +204,7 @@ def test_gradients_hold_the_moments_to_start_from_fixed():
         np.testing.assert_allclose([gradient[index] for gradient in gradients], difference, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_moments_to_start_from_are_interpolated_on_another_grid():
     model, at = motif(softplus, genes=1), np.array([0.4, 0.6, 1.9, 2.2, 3.0])
 

@@ -266,6 +266,7 @@ def derivatives():
     return derivative
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [
     pytest.param(name, marks=pytest.mark.slow if name.startswith("spring") else ()) for name in GRADIENTS])
 def test_gradient(derivatives, name):

@@ -43,6 +43,7 @@ def proposed_steps(message):
     return int(re.search(r"steps=(\d+)", message)[1])
 
 
+@pytest.mark.thorough
 def test_an_unstable_step_names_state_row_and_remedy():
     result, texts = messages(lambda: lfm.filter(elimination(10.0), ROWS, Y))
     assert len(texts) == 1 and "'drug'" in texts[0] and "row 0" in texts[0] and 'method="exponential"' in texts[0]

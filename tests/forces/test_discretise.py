@@ -187,6 +187,7 @@ def test_phi_functions_equal_the_augmented_exponential(name):
 phi = jax.jit(phi_functions)
 
 
+@pytest.mark.thorough
 def test_phi_functions_of_fast_decays():
     """They tend to 1/z, 1/z and 1/(2 z); the derivatives equal differences."""
     rates = np.array([1e4, 1e9, 1e15, 1e30])

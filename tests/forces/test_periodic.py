@@ -205,6 +205,7 @@ def test_derivatives_by_all_parameters_are_finite_differences(kind):
     assert_allclose(jax.jit(jax.hessian(total))(point), second, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_repeated_eigenvalues_have_finite_derivatives():
     """All eigenvalues of a circulant matrix but the first come in pairs; the space of three does not split one."""
     angle = 2 * np.pi * np.arange(12) / 12

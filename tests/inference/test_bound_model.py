@@ -92,6 +92,7 @@ def test_the_density_is_numpyros_and_its_gradient_agrees_with_differences(bound)
     assert np.isfinite(bound.log_prior(np.zeros(4), np.ones((5, 2), int)))  # data of another type
 
 
+@pytest.mark.thorough
 def test_many_data_sets_are_a_vmap():
     bound, z = lfm.bind(small, TIMES, Y), np.array([0.1])
     densities = jax.vmap(bound.log_density, in_axes=(None, 0))(z, jnp.stack([jnp.asarray(Y), jnp.asarray(OTHER)]))
@@ -366,6 +367,7 @@ def test_a_model_is_what_its_function_computes_now(kind, monkeypatch):
     assert changed_values[0] == pytest.approx(numpyro_density(current, (TIMES, Y), {"decay": 0.1}), rel=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_digest_tells_models_that_need_the_values_of_their_data_apart():
     def branching(spread):
         def model(times, y=None):
@@ -442,6 +444,7 @@ def test_wrong_values_positions_and_data_are_named(bound):
             bound.log_density(z, y)
 
 
+@pytest.mark.thorough
 def test_observations_of_one_output_may_be_a_vector():
     def single(times, y=None):
         numpyro.sample("decay", dist.LogNormal(0.0, 0.3))
@@ -451,6 +454,7 @@ def test_observations_of_one_output_may_be_a_vector():
     assert float(vector) == float(column)
 
 
+@pytest.mark.thorough
 def test_fixing_in_compiled_code_leaves_nothing_behind(bound):
     values, z = {"decay": 0.8, "noise_sd": 0.1}, np.array([0.2])
     compiled_value = jax.jit(lambda z: bound.fix(values).log_prior(z))(z)

@@ -116,6 +116,7 @@ def test_no_adaptation_without_weight_and_none_that_overflows():
 # Adaptation in a chain
 
 
+@pytest.mark.thorough
 def test_acceptance_rate_converges_to_the_target(correlated):
     accepted = np.asarray(correlated.get_extra_fields(group_by_chain=True)["accepted"], float)
     per_chain = accepted.mean(axis=1)  # independent chains give the error of their own mean

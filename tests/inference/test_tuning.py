@@ -54,6 +54,10 @@ def test_a_result_names_its_density_and_gives_it_again(result):
     converged = gaussian(problem, iterations=40)
     from_filter = gaussian(ModelDraws(lfm.bind(crossing, TIMES, Y), problem.draws))
     assert np.std(recorded - converged) < max(2 * TOLERATED_ERROR, 0.3 * np.std(from_filter - converged))
+
+
+@pytest.mark.thorough
+def test_a_forecast_finds_the_density_of_its_result(result):
     mean = lfm.forecast(result, crossing, [4.5], draws=8, progress=False)  # compares log likelihoods
     assert "predictions" in ResultView.of(mean).groups
 

@@ -9,6 +9,7 @@ from lfm_ppl.io import loading
 ROWS = {"theophylline": (12, 11), "p53": (21,), "coal": (111,), "house": (792,), "calls": (27716,)}
 
 
+@pytest.mark.thorough
 def test_the_simulated_room_is_that_of_the_model():
     data, expected = lfm.datasets.load("room"), loading.load("room").simulate()
     np.testing.assert_array_equal(data.y, expected.y)

@@ -52,6 +52,7 @@ def test_leading_dimensions_of_the_value_are_a_batch(y):
         np.testing.assert_allclose(batch[index, 0], exact, rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_vmap_over_parameters(y, batch):
     many, values, _ = batch
     for index in range(3):
@@ -126,6 +127,7 @@ def test_handlers(y, prior):
     assert log_density(model, (TIMES, y, False, 1.0), {}, {})[0] == 0.0
 
 
+@pytest.mark.thorough
 def test_expanded_and_masked_batches(y):
     exact = motif.log_density(y, **motif.THETA)
     batch = jnp.stack([y, 2.0 * y])

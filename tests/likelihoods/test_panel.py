@@ -126,6 +126,7 @@ def test_many_series_go_one_after_another_on_a_cpu(y, monkeypatch):
                  evaluate()(rates, LENGTHSCALE))
 
 
+@pytest.mark.thorough
 def test_series_with_times_of_their_own_padded_or_all_missing(y, looped, together):
     _, loop = looped
     short = 3
@@ -155,6 +156,7 @@ def test_one_impossible_series_leaves_the_others_alone(y, together):
     assert np.isfinite(by_lengthscale)
 
 
+@pytest.mark.thorough
 def test_in_a_plate(y, looped):
     results, _ = looped
 
@@ -188,6 +190,7 @@ def test_one_series_in_a_plate_is_an_error(y):
     assert single.expand(()) is single
 
 
+@pytest.mark.thorough
 def test_samples(y):
     distribution = panel(RATES, LENGTHSCALE)
     assert (distribution.batch_shape, distribution.event_shape) == ((3,), (len(TIMES), 1))

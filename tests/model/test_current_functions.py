@@ -79,6 +79,7 @@ def test_a_helper_that_changes_between_two_models(name, monkeypatch):
     assert abs(changed_value - initial_value) > 1e-3
 
 
+@pytest.mark.thorough
 def test_an_object_without_a_hash():
     dynamics = Decay()
     values = []

@@ -72,6 +72,7 @@ def test_jumps_at_rows_keep_the_order_four():
     assert 3.7 < np.log2(error[0] / error[1]) < 4.5
 
 
+@pytest.mark.thorough
 def test_simulated_states_jump_with_the_input():
     model = pushed(lambda x, u, t: STEP(t) - x)
     simulation = lfm.simulate(jax.random.key(0), model, ROWS, steps=400)

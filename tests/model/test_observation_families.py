@@ -203,6 +203,7 @@ def test_errors(make, message):
         make()
 
 
+@pytest.mark.thorough
 def test_simulation_draws_from_the_family():
     observations = lfm.Observations(lfm.PoissonObservation(lambda x, u, t: x[:1]),
                                     lfm.BernoulliObservation(lambda x, u, t: x))
@@ -237,6 +238,7 @@ def test_at_rate_zero_the_count_is_zero(family, slope):
     assert float(family.log_prob(jnp.array([1e-9]), jnp.zeros(1))[0]) == pytest.approx(-2e-9)
 
 
+@pytest.mark.thorough
 def test_limits_of_rounded_values_leave_nothing_out():
     family = lfm.CensoredObservation(lambda x, u, t: x, sd=1.0, left=0.0, width=1.0)
     values = jnp.arange(0.0, 12.0)

@@ -125,6 +125,7 @@ def test_a_fast_rate_between_sparse_times():
     assert np.abs(y).max() < 0.6
 
 
+@pytest.mark.thorough
 def test_a_rate_that_no_step_resolves():
     """Within a lag of 1e-7 of its equilibrium, by exponential steps."""
     model = lfm.LatentForceModel(

@@ -70,6 +70,7 @@ def test_turning_the_radar_changes_nothing(likelihoods, bearing):
     np.testing.assert_allclose(turned_mean, mean, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_the_smoother_finds_the_target_where_the_azimuth_jumps(likelihoods):
     data, run = likelihoods
     state = np.asarray(data.truth["state"])[::10]

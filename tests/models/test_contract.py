@@ -19,7 +19,7 @@ from lfm_ppl.likelihoods.likelihood_site import likelihood_site
 
 MODELS = sorted(loading.available())
 CHEAP = ("spring", "ginzburg-landau", "ballistic", "room")
-"""Models that are simulated from the prior by default; of others the density alone is asked for."""
+"""Models that are simulated by default; of others the density alone is asked for."""
 
 COSTLY = ("ballistic-3d", "call-centre", "epidemic", "gps", "home-heating", "thyroid")
 """Models whose density takes long to compile; it is run with -m slow."""
@@ -86,7 +86,8 @@ def test_draws_of_the_prior_have_the_shape_of_the_data(name):
 
 
 @pytest.mark.parametrize("name", [
-    pytest.param(name, marks=[pytest.mark.slow] if name == "gps" else []) for name in MODELS])
+    pytest.param(name, marks=[] if name in CHEAP else [pytest.mark.slow] if name == "gps" else [pytest.mark.thorough])
+    for name in MODELS])
 def test_default_data_depend_on_the_seed_alone_and_survive_a_file_and_other_units(name, tmp_path):
     file = loading.load(name)
     data = file.simulate(seed=123)

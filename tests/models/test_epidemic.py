@@ -33,6 +33,7 @@ def test_dynamics_are_those_of_the_sir_model(functions):
     assert float(result[0]) == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.thorough
 def test_known_rates_are_fixed_unless_freed(file):
     data = file.simulate()
     assert data.y.shape == (60, 1) and np.all(data.y == np.round(data.y))

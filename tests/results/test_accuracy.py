@@ -214,6 +214,7 @@ def test_ratios_of_a_linear_model_are_zero_on_the_grid(linear):
     assert set(report.table.index) == {"rate", "half_life"}
 
 
+@pytest.mark.thorough
 def test_ratios_of_a_linear_model_are_zero_up_to_the_noise_of_particles(linear):
     report = check_accuracy(linear, relaxation, reference="particles", draws=60, particles=200, seed=1, progress=False)
     z = report.log_ratio / np.sqrt((report.dataset["noise_sd"].values ** 2).mean())

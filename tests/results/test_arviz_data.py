@@ -140,6 +140,7 @@ def test_loo_and_compare(tmp_path, result, datasets):
     assert list(table.index) == ["good", "bad"] and table.loc["good", "rank"] == 0
 
 
+@pytest.mark.thorough
 def test_predictive_checks_and_prior_sensitivity_of_a_fit():
     y, rng = motif.data(missing=False), np.random.default_rng(0)
     draws = {name: value * np.exp(0.1 * rng.normal(size=(2, 60, *np.shape(value))))

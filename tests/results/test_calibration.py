@@ -26,6 +26,7 @@ def test_the_statistics_accept_uniform_ranks():
     assert min(calibration.p_values(uniform, DRAWS).values()) > 0.01
 
 
+@pytest.mark.thorough
 def test_p_values_are_those_of_pearson_and_kolmogorov():
     """Many data sets and possible ranks: the simulated distributions approach the known ones."""
     rank = np.random.default_rng(4).integers(0, 1024, 2000)
@@ -97,6 +98,7 @@ def test_exact_draws_are_calibrated_and_wide_ones_are_not(conjugate):
         assert calibration.p_values(wide.ranks[name], 63)["ecdf"] < 0.001, name
 
 
+@pytest.mark.thorough
 def test_one_by_one_finds_the_same_ranks(conjugate):
     result = run(1.0, method="sequential")
     for name, rank in conjugate[0].ranks.items():

@@ -58,6 +58,7 @@ def test_fixed_parameters_are_those_of_the_fit(result):
     np.testing.assert_allclose(lfm.evaluate_field(fixed, source, [0.3])["mean"], expected["mean"], atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_the_sd_contains_the_variance_beyond_the_forces(result):
     position = np.array([[5.0, 5.0]])  # far from the points
     evaluated = lfm.evaluate_field(result, separable, position)

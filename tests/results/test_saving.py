@@ -24,6 +24,7 @@ def test_every_figure_in_every_format(tmp_path, result):
     assert "CDKN1A (a.u.)" in (folder / "fit.svg").read_text(encoding="utf-8")  # text, not outlines
 
 
+@pytest.mark.thorough
 def test_figures_without_their_group_are_left_out(tmp_path, datasets):
     groups = {name: datasets[name] for name in ("posterior", "data")}
     paths = save_figures(arviz_data.build(groups), tmp_path, "png")

@@ -109,6 +109,7 @@ def test_a_forecast_of_a_selected_series_is_that_of_the_panel(result, times, tmp
         assert lfm.score(alone, np.zeros((len(times), 1))).loc["all", "n"] == len(times)
 
 
+@pytest.mark.thorough
 def test_the_likelihood_of_a_selected_series_is_that_of_the_panel(result):
     with pytest.raises(ValueError, match="selected from"):
         rebuilding.problem(lfm.select_series(result, "Bo"), model)

@@ -107,6 +107,7 @@ def test_derived_parameters_and_warnings_are_marked_in_a_file_too(converted, tmp
     assert group(loaded, "posterior")["gene"].values.tolist() == ["p21", "sestrin"]
 
 
+@pytest.mark.thorough
 def test_draws_without_an_mcmc_and_without_derived_ones(mcmc, converted):
     draws = {name: value for name, value in mcmc.get_samples(group_by_chain=True).items() if name != "half_life"}
     with pytest.warns(lfm.ConvergenceWarning):
@@ -139,6 +140,7 @@ def test_the_plate_of_a_panel_is_a_dimension_of_every_group():
     assert group(result, "log_likelihood")["patient"].values.tolist() == sorted(3 * labels)
 
 
+@pytest.mark.thorough
 def test_wrong_names_and_runs_are_refused(mcmc):
     for keywords, name in (({"dims": {"deca": ["gene"]}}, "'deca'"), ({"coords": {"gen": ["a", "b"]}}, "'gen'"),
                            ({"dims": {"decay": ["gene", "tissue"]}}, "'decay'"),
