@@ -19,13 +19,15 @@ RANDOM_WALKS = [(name, {"sampler": "ram", "warmup": 1000, "samples": 1000})
 def test_chains_converge_and_cover_the_truth(name, options):
     file = loading.load(name)
     data = file.simulate()
+    if not options and file.target_accept is not None:  # as the command line does
+        options = {"sampler_options": {"target_accept_prob": file.target_accept}}
     with warnings.catch_warnings():
         warnings.simplefilter("error", lfm.ConvergenceWarning)
         result = lfm.fit(file.model, data.times, data.y, model_kwargs=file.keywords(data, {}), truth=data.truth,
                          progress=False, **options)
     view, table = ResultView.of(result), summary(result)
     assert table["r_hat"].max() <= 1.01 and table["ess_bulk"].min() >= 400
-    assert options or float(view.group("sample_stats")["diverging"].mean()) < 0.005
+    assert "sampler" in options or not view.group("sample_stats")["diverging"].any()
     for name in {"log_likelihood", "posterior_predictive", "trajectories"} & set(view.groups):
         assert all(np.isfinite(variable).all() for variable in view.group(name).data_vars.values()), name
     posterior, truth = view.posterior, view.group("truth")
