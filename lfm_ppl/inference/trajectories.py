@@ -27,7 +27,8 @@ from lfm_ppl.inference.problem import Partition, Problem, signature
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, replicate, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
-from lfm_ppl.model.simulate import LONGEST_PRODUCT, input_breakpoints, simulate_missing_states
+from lfm_ppl.model.simulate import input_breakpoints
+from lfm_ppl.model.simulated_path import LONGEST_PRODUCT, simulate_missing_states
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.model.stiff_simulation import warn_of_infinite_states
 from lfm_ppl.particles.particle_filter import ParticleSettings
