@@ -27,9 +27,10 @@ from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.problem import Partition, Problem, signature
 from lfm_ppl.inference.trace import Programs, TracedModel, trace_model
 from lfm_ppl.likelihoods.handlers.approximate import approximate
+from lfm_ppl.likelihoods.handlers.binding import remove_likelihood
 from lfm_ppl.likelihoods.handlers.fixing import fix
 from lfm_ppl.likelihoods.likelihood import Likelihood
-from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite, likelihood_sites, remove_likelihood, single_site
+from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite, likelihood_sites, single_site
 from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.likelihoods.panel import Panel
 from lfm_ppl.utils import checks

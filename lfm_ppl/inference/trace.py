@@ -33,14 +33,8 @@ from numpyro.infer.util import log_density as constrained_log_density
 from lfm_ppl.filtering.time_grid import refuse_traced_times
 from lfm_ppl.inference.problem import Problem, is_numeric, shapes
 from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, latent_sites
-from lfm_ppl.likelihoods.likelihood_site import (
-    LikelihoodSite,
-    SiteTimes,
-    likelihood_sites,
-    record_likelihoods,
-    replace_anchors,
-    replace_times,
-)
+from lfm_ppl.likelihoods.handlers.binding import SiteTimes, record_likelihoods, replace_anchors, replace_times
+from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite, likelihood_sites
 from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.utils import checks
 
