@@ -37,7 +37,7 @@ from lfm_ppl.model.model_arguments import (
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.time_degree import degree_in_time
-from lfm_ppl.model.user_functions import TracedFunction, own_functions, trace
+from lfm_ppl.model.user_functions import TracedFunction, own_functions, trace_function
 from lfm_ppl.utils import checks
 
 _ROOTS = {"sqrt", "rsqrt", "cbrt", "pow"}
@@ -186,7 +186,7 @@ class LatentForceModel(eqx.Module):
 
     def _trace_observation(self, function: Callable) -> TracedFunction:
         """Return a traced observation function; raise ValueError unless it returns a vector."""
-        traced = trace("the observation function", "h(x, u, t)", function, *self._arguments)
+        traced = trace_function("the observation function", "h(x, u, t)", function, *self._arguments)
         if len(getattr(traced.shape, "shape", ())) != 1:
             raise ValueError(f"the observation function must return a vector (D,), got {describe_shape(traced.shape)}. "
                              "For one output, return x[:1] or jnp.array([...]).")
@@ -195,9 +195,9 @@ class LatentForceModel(eqx.Module):
     def traced_functions(self) -> dict[str, TracedFunction]:
         """Return the traced functions of the model by name, after checks of their shapes and indices."""
         arguments, observation = self._arguments, self.observation
-        functions = {"dynamics": trace("dynamics", "f(x, u, t)", self.dynamics, *arguments)}
+        functions = {"dynamics": trace_function("dynamics", "f(x, u, t)", self.dynamics, *arguments)}
         if callable(self.process_noise):
-            functions["process_noise"] = trace("process_noise", "(x, u, t)", self.process_noise, *arguments)
+            functions["process_noise"] = trace_function("process_noise", "(x, u, t)", self.process_noise, *arguments)
         self._check_state_shapes(**functions)
         functions["observation"] = self._trace_observation(observation.function)
         (outputs,) = functions["observation"].shape.shape
@@ -208,10 +208,10 @@ class LatentForceModel(eqx.Module):
         if any(not 0 <= index < outputs for index in observation.angular):
             raise ValueError(f"angular indices must lie in 0..{outputs - 1}, got {observation.angular}.")
         if callable(observation.covariance):
-            functions["covariance"] = trace("the observation covariance", "(x, u, t)", observation.covariance,
-                                            *arguments)
+            functions["covariance"] = trace_function("the observation covariance", "(x, u, t)", observation.covariance,
+                                                     *arguments)
         for name, function in self.deterministics.items():
-            traced = trace(f"the deterministic {name!r}", "(x, u, t)", function, *arguments)
+            traced = trace_function(f"the deterministic {name!r}", "(x, u, t)", function, *arguments)
             shape = getattr(traced.shape, "shape", traced.shape)
             if shape != ():
                 raise ValueError(f"{traced.label} must return one number, shape (); it returned {shape}. The entry of "
@@ -219,7 +219,8 @@ class LatentForceModel(eqx.Module):
             functions[f"deterministic {name}"] = traced
         for traced in functions.values():
             traced.check_indices(("x", "u"))
-        means = {f"mean of {name}": trace(f"the mean of the force {name!r}", "(t)", force.mean_at, arguments[2])
+        means = {f"mean of {name}": trace_function(f"the mean of the force {name!r}", "(t)", force.mean_at,
+                                                  arguments[2])
                  for name, force in self.forces.items() if callable(force.mean)}
         return functions | means
 

@@ -13,8 +13,8 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.problem import signature
-from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.inference.trajectories import has_noise_of_rows
+from lfm_ppl.inference.unbound_model import SharedModel
 from lfm_ppl.io.data import as_data
 from lfm_ppl.io.data_set import Data, at_origin
 from lfm_ppl.io.input_table import keywords_by_site, model_keywords

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl.inference.trace import SharedModel
+from lfm_ppl.inference.unbound_model import SharedModel
 from lfm_ppl.parallel.cluster import Workers, check_workers
 from lfm_ppl.parallel.run import outcomes
 from lfm_ppl.parallel.task import Task
