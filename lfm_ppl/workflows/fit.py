@@ -264,15 +264,15 @@ def fit(
         **likelihood_settings(site_model.site.example),
         "assumptions": best_effort("the model in words", functools.partial(describe_assumptions, site_model), None),
     }) for name, site_model in bound.site_models.items()}
-    requested = {name: site.requested_times for name, site in sites.items()}
-    at = None if at is None else requested if bound.is_by_site else requested[bound.site.name]
+    times_by_site = {name: site.requested_times for name, site in sites.items()}
+    requested_times = None if at is None else times_by_site if bound.is_by_site else times_by_site[bound.site.name]
     if sampler == "map":
         chains, warmup, thin, method_of_chains = 1, 0, None, None
     else:
         thin = thin or SAMPLERS[sampler].steps_per_draw * bound.size or 1
         method_of_chains = sampling.available_method(chain_method, chains)
-    options = FitOptions(sampler, chains, warmup, samples, thin, seed, dict(fixed or {}), at, trajectory_draws, init,
-                         dict(sampler_options or {}), method_of_chains, settings)
+    options = FitOptions(sampler, chains, warmup, samples, thin, seed, dict(fixed or {}), requested_times,
+                         trajectory_draws, init, dict(sampler_options or {}), method_of_chains, settings)
     title = str(name or getattr(numpyro_model, "__name__", "model"))
     description = {
         "model": title, "description": model_docstring(numpyro_model),
@@ -323,26 +323,27 @@ def fit(
     return result
 
 
-def _site_problem(bound: BoundModel, site_data: SiteData, clock: tuple[str | None, str], at: Any,
+def _site_problem(bound: BoundModel, site_data: SiteData, clock: tuple[str | None, str], requested_times: Any,
                   truth: Mapping[str, Any] | None, dims: Mapping[str, Sequence[str]] | None,
                   coords: Mapping[str, Sequence[Any]] | None) -> SiteProblem:
     """Check the arguments of `fit` on one likelihood site."""
     data, unit = site_data.on_clock, site_data.unit
     if clock[0] is None and data is not None:  # each site may have a unit of its own
         clock = None, data.units.get("time", "")
-    if calendar_time.holds_dates(at):
-        at = calendar_time.positions("at", at, *clock)
-    elif at is not None and unit is not None and unit != clock[1]:  # numbers in the unit of the user's data
-        checks.refuse_durations("at", at)
-        at = np.asarray(at, float) * (calendar_time.SECONDS[unit] / calendar_time.SECONDS[clock[1]])
+    if calendar_time.holds_dates(requested_times):
+        requested_times = calendar_time.positions("at", requested_times, *clock)
+    elif requested_times is not None and unit is not None and unit != clock[1]:  # in the user's unit
+        checks.refuse_durations("at", requested_times)
+        requested_times = np.asarray(requested_times, float) * (calendar_time.SECONDS[unit]
+                                                                / calendar_time.SECONDS[clock[1]])
     with calendar_time.in_messages(*clock):
-        check_requested_times(bound, at)
-        warn_of_missing_predictions(bound, at)
+        check_requested_times(bound, requested_times)
+        warn_of_missing_predictions(bound, requested_times)
     if data is not None:
         coords = {"output": data.outputs, **({SERIES: data.series} if data.series else {}), **(coords or {})}
     labels = Labels.of(bound, dims, coords, site_data.labelled_y)
     truth = data.truth if truth is None and data is not None else truth
-    return SiteProblem(bound, labels, at, data, clock, checked_truth(bound, truth, labels))
+    return SiteProblem(bound, labels, requested_times, data, clock, checked_truth(bound, truth, labels))
 
 
 class _StoppedError(KeyboardInterrupt):
