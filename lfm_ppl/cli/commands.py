@@ -22,19 +22,16 @@ from cyclopts import App, Group, Parameter
 import lfm_ppl
 from lfm_ppl.cli import session
 from lfm_ppl.cli.help_format import TwoColumnFormatter
+from lfm_ppl.cli.option_types import Line, Model, Result, Text
 from lfm_ppl.cli.options import (
     GENERAL,
     CheckOptions,
     Debug,
     FitArguments,
     ForecastOptions,
-    Line,
-    Model,
     PlotOptions,
-    Result,
     SimulateOptions,
     StudyOptions,
-    Text,
 )
 from lfm_ppl.studies import catalogue
 

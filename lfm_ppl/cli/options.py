@@ -6,13 +6,26 @@ nothing that takes long, so that the help of a command appears at once.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Group, Parameter
 
+from lfm_ppl.cli.option_types import (
+    Count,
+    CountOrZero,
+    File,
+    Folder,
+    Fraction,
+    Name,
+    Names,
+    Pairs,
+    Positive,
+    Text,
+    TimeUnit,
+    check_method,
+    integer_at_least,
+)
 from lfm_ppl.inference.samplers import SAMPLERS
 
 # Value of --rule -> class in lfm_ppl, which is used with its defaults.
@@ -28,68 +41,10 @@ MOST_JOBS = 4
 """Default largest number of processes; each takes one or two GiB."""
 
 
-def _number(kind: Callable[[str], Any], is_valid: Callable[[Any], bool], expected: str) -> Callable:
-    """Return the converter of an option whose value is a number."""
-
-    def convert(hint: Any, tokens: Any) -> Any:
-        text = tokens[0].value
-        with contextlib.suppress(ValueError):
-            if is_valid(value := kind(text)):
-                return value
-        raise ValueError(f"expected {expected}, got {text!r}.")
-
-    return convert
-
-
-def _refuse_empty(hint: Any, value: Any) -> None:
-    if "" in (value if isinstance(value, tuple) else (value,)):
-        raise ValueError("The value is empty.")
-
-
-def _check_time_unit(hint: Any, unit: str | None) -> None:
-    if unit is not None:
-        from lfm_ppl.utils import calendar_time, checks
-
-        checks.one_of("unit of time", unit, calendar_time.SECONDS)
-
-
-def _check_method(hint: Any, method: str | None) -> None:
-    if method is not None:
-        from lfm_ppl.filtering.integrators.methods import METHODS
-        from lfm_ppl.utils import checks
-
-        checks.one_of("method", method, METHODS)
-
-
-def _integer(least: int) -> Callable:
-    return _number(int, lambda value: value >= least, f"a whole number of at least {least}")
-
-
-def _real(end: float, expected: str) -> Callable:
-    return _number(float, lambda value: 0 < value < end, expected)
-
-
 def _options_of(title: str) -> Parameter:
     """Return the decorator of a dataclass whose options have a common title in the help."""
     return Parameter(name="*", group=Group.create_ordered(title))
 
-
-Text = Annotated[str, Parameter(validator=_refuse_empty)]
-File = Annotated[Text, Parameter(metavar="FILE")]
-Folder = Annotated[Text, Parameter(metavar="DIR")]
-Name = Annotated[Text, Parameter(metavar="NAME")]
-TimeUnit = Annotated[str, Parameter(metavar="UNIT", validator=_check_time_unit)]
-Names = Annotated[Text, Parameter(metavar="A,B,...")]
-Pairs = Annotated[tuple[str, ...], Parameter(metavar="NAME=VALUE", validator=_refuse_empty)]
-Count = Annotated[int, Parameter(metavar="N", converter=_integer(1))]
-CountOrZero = Annotated[int, Parameter(metavar="N", converter=_integer(0))]
-Positive = Annotated[float, Parameter(converter=_real(float("inf"), "a number above zero"))]
-Fraction = Annotated[float, Parameter(converter=_real(1.0, "a number between 0 and 1"))]
-
-Model = Annotated[Text, Parameter(help="a shipped model (see `lfm-ppl models`) or the path of a Python file")]
-Result = Annotated[Text, Parameter(help="a results folder or a posterior.nc")]
-Line = Annotated[tuple[str, ...], Parameter(parse=False)]
-"""The words of the command line, which `lfm_ppl.cli.main` passes to a command."""
 
 GENERAL = Group.create_ordered("options")
 _GENERAL = Parameter(name="*", group=GENERAL)
@@ -246,7 +201,7 @@ class Approximation:
     tolerance: Annotated[Positive, Parameter(metavar="SD")] | None = None
     """adaptive steps: largest error of an integration step, in standard deviations; excludes --iterations (default:
     equal steps)"""
-    method: Annotated[str, Parameter(metavar="METHOD", validator=_check_method)] | None = None
+    method: Annotated[str, Parameter(metavar="METHOD", validator=check_method)] | None = None
     """method of integration: runge-kutta, or exponential for stiff dynamics (default: runge-kutta)"""
     iterations: CountOrZero | None = None
     """iterations of posterior linearisation; 0: a single pass (default: 3, or as many as nuts and ram find to suffice;
@@ -256,7 +211,7 @@ class Approximation:
     costs some hundred times as much"""
     upper: Pairs = ()
     """upper bound"""
-    grid: Annotated[int, Parameter(metavar="N", converter=_integer(2))] | None = None
+    grid: Annotated[int, Parameter(metavar="N", converter=integer_at_least(2))] | None = None
     """number of equidistant times at which --lower and --upper hold; cost and error grow with it (default: the times
     of the data, with more in gaps above 1/20 of the record; 100 if the data have more)"""
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lfm_ppl.model.latent_force_model import LatentForceModel
-from lfm_ppl.model.user_functions import own_function, trace
+from lfm_ppl.model.user_functions import own_function, trace_function
 from lfm_ppl.utils import checks
 
 
@@ -164,7 +164,8 @@ def _output_size(model: LatentForceModel, number: int, function: Any) -> int:
         raise TypeError("constraints must be a function c(x, u, t), or several, each feasible where >= 0; entry "
                         f"{number} is {type(function).__name__}. A number belongs to lower or upper.")
     u = jax.ShapeDtypeStruct((len(model.force_names),), jnp.result_type(float))
-    traced = trace(f"constraints[{number}]", "c(x, u, t)", function, model.initial_state.mean, u, jnp.zeros(()))
+    traced = trace_function(f"constraints[{number}]", "c(x, u, t)", function, model.initial_state.mean, u,
+                            jnp.zeros(()))
     traced.check_indices(("x", "u"))
     shape = getattr(traced.shape, "shape", None)
     if shape is None or len(shape) > 1:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.trace import SharedModel
+from lfm_ppl.inference.unbound_model import SharedModel
 from lfm_ppl.utils import checks
 
 
@@ -121,11 +121,11 @@ def bind(numpyro_model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y:
         raise ValueError(f"the model reads times or y by the name of a site, and there is no entry {entry}; pass dicts "
                          f"by site, in lfm.fit {{{entry}: (times, y), ...}}.") from error
     if is_by_site and not bound.is_by_site:
-        sites = ", ".join(site.name for site in bound.traced.likelihoods) or "none"
+        sites = ", ".join(site.name for site in bound.unbound.likelihoods) or "none"
         raise ValueError(f"the likelihood sites of the model are {sites}, and there are data of {', '.join(values)}: "
                          "pass {name: (times, y), ...} with all sites, and write numpyro.sample(name, "
                          "lfm.MarginalLikelihood(system, times[name]), obs=y[name]) in model(times, y).")
-    sites_of_other_data = bound.traced.sites_of_other_data(bound.constants) if is_by_site else []
+    sites_of_other_data = bound.unbound.sites_of_other_data(bound.constants) if is_by_site else []
     for name, site_model in bound.site_models.items():
         _check_data(site_model, values[name] if is_by_site else values, sites_of_other_data)
     return bound
@@ -154,7 +154,7 @@ def _check_data(bound: BoundModel, values: jax.Array, sites_of_other_data: Seque
     remedy = f"Write numpyro.sample({name!r}, ..., obs={argument}), with the argument y of the model."
     if name in bound.sites:
         raise ValueError(f"the model does not use the data: its likelihood site {name!r} is not observed. {remedy}")
-    if name in bound.traced.sites_of_times:
+    if name in bound.unbound.sites_of_times:
         raise ValueError(f"the likelihood site {name!r} observes the times, not the data. {remedy}")
     if name in sites_of_other_data:
         raise ValueError(f"the likelihood site {name!r} observes other data than those that were passed. {remedy}")

@@ -1,7 +1,7 @@
 """A NumPyro model with its times and data bound: its log posterior as a plain function, compiled once.
 
-1. `bind` checks times and data and runs the model (`lfm_ppl.inference.trace`), which gives a `Problem`: data, times,
-   known inputs and time grids.
+1. `bind` checks times and data and runs the model (`lfm_ppl.inference.unbound_model`), which gives a `Problem`: data,
+   times, known inputs and time grids.
 2. Methods of `BoundModel` are functions of z and a problem, traced when first called and kept by name. Models of one
    structure have programs of one text, which are compiled once (`lfm_ppl.utils.programs`).
 3. What a model needs the values of is a constant of its programs: it belongs to the structure of the problem.
@@ -25,11 +25,12 @@ from lfm_ppl.filtering.smoother import SmootherResult
 from lfm_ppl.filtering.stiffness import ExplicitSteps, long_step_message, warn_of_message
 from lfm_ppl.inference.optimise import Objective, value_and_gradient
 from lfm_ppl.inference.problem import Partition, Problem, signature
-from lfm_ppl.inference.trace import Programs, TracedModel, trace_model
+from lfm_ppl.inference.unbound_model import Programs, UnboundModel, model_and_problems
 from lfm_ppl.likelihoods.handlers.approximate import approximate
+from lfm_ppl.likelihoods.handlers.binding import remove_likelihood
 from lfm_ppl.likelihoods.handlers.fixing import fix
 from lfm_ppl.likelihoods.likelihood import Likelihood
-from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite, likelihood_sites, remove_likelihood, single_site
+from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite, likelihood_sites, single_site
 from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.likelihoods.panel import Panel
 from lfm_ppl.utils import checks
@@ -81,7 +82,7 @@ class BoundModel:
         size: d.
         sites: names of the latent sites.
         model: the NumPyro model.
-        traced: the model after its run with numbers, without its data.
+        unbound: the model after its run with numbers, without its data.
         problem: data, times and inputs as the argument of each program.
         model_data: the data of all sites.
         constants: the same with times and inputs as constants, for functions that need their values.
@@ -91,10 +92,10 @@ class BoundModel:
 
     anchor_point: np.ndarray | None = None
 
-    def __init__(self, traced: TracedModel, constants: Problem, problem: Problem, programs: Programs,
+    def __init__(self, unbound: UnboundModel, constants: Problem, problem: Problem, programs: Programs,
                  selected: str | None = None) -> None:
-        self.traced, self.constants, self.problem, self.programs = traced, constants, problem, programs
-        self.names, self.size, self.sites, self.model = traced.names, traced.size, traced.sites, traced.model
+        self.unbound, self.constants, self.problem, self.programs = unbound, constants, problem, programs
+        self.names, self.size, self.sites, self.model = unbound.names, unbound.size, unbound.sites, unbound.model
         # One object: data that are constants are built anew by each call of `observations`.
         self.model_data: Any = problem.observations
         self._selected = selected
@@ -107,12 +108,12 @@ class BoundModel:
     @classmethod
     def of(cls, model: Callable, arguments: tuple, keywords: Mapping[str, Any], caller: str,
            programs: Programs | None = None, selected: str | None = None) -> BoundModel:
-        """Bind a NumPyro model to its arguments, the last of which is its data; see `trace_model`."""
+        """Bind a NumPyro model to its arguments, the last of which is its data; see `model_and_problems`."""
         programs = programs or Programs()
-        traced, constants, problem = trace_model(model, arguments, keywords, caller, programs)
+        unbound, constants, problem = model_and_problems(model, arguments, keywords, caller, programs)
         # Programs of constants serve no other data set, and end with the bound model.
-        bound = cls(traced, constants, problem, programs if problem.has_traced_inputs else Programs(), selected)
-        bound._trace = None if checks.traced(bound.model_data) else traced.at_medians
+        bound = cls(unbound, constants, problem, programs if problem.has_traced_inputs else Programs(), selected)
+        bound._trace = None if checks.traced(bound.model_data) else unbound.at_medians
         return bound
 
     @property
@@ -128,7 +129,7 @@ class BoundModel:
         """Whether times and data are dictionaries by name of a likelihood site."""
         arguments, _ = self.constants.call()
         times = arguments[0] if arguments else None
-        return isinstance(times, Mapping) and set(times) == {site.name for site in self.traced.likelihoods}
+        return isinstance(times, Mapping) and set(times) == {site.name for site in self.unbound.likelihoods}
 
     @property
     def site_models(self) -> dict[str, BoundModel]:
@@ -143,7 +144,7 @@ class BoundModel:
 
     def _copy(self, constants: Problem, problem: Problem, selected: str | None) -> BoundModel:
         """Return the same model with other data or another selected site."""
-        bound = BoundModel(self.traced, constants, problem, self.programs, selected)
+        bound = BoundModel(self.unbound, constants, problem, self.programs, selected)
         bound._modifications, bound._layouts = self._modifications, self._layouts
         bound.anchor_point = self.anchor_point
         return bound
@@ -168,14 +169,14 @@ class BoundModel:
         Raises:
             ValueError: the model has no such site, or several.
         """
-        site = single_site(self.traced.likelihoods, self._selected)
+        site = single_site(self.unbound.likelihoods, self._selected)
         anchor = self.constants.anchors.get(site.name)
         return site if anchor is None else site._replace(distribution=site.distribution.with_about(anchor))
 
     @property
     def has_likelihood(self) -> bool:
         """Whether the model has one likelihood site."""
-        return self._selected is not None or len(self.traced.likelihoods) == 1
+        return self._selected is not None or len(self.unbound.likelihoods) == 1
 
     def __repr__(self) -> str:
         """Return the model's name and its parameters."""
@@ -192,7 +193,7 @@ class BoundModel:
         if self.problem.data is not None:
             return self._with_checked_data(y)
         arguments, keywords = self.constants.call()
-        return BoundModel.of(self.model, (*arguments[:-1], y), keywords, self.traced.caller, self.programs,
+        return BoundModel.of(self.model, (*arguments[:-1], y), keywords, self.unbound.caller, self.programs,
                              self._selected)._anchored_as(self)
 
     def _with_checked_data(self, y: Any) -> BoundModel:
@@ -277,9 +278,9 @@ class BoundModel:
 
     def log_prior(self, z: ArrayLike, y: ArrayLike | None = None) -> jax.Array:
         """Return the log prior density of the unconstrained parameters, Jacobian included."""
-        traced = self.traced
+        unbound = self.unbound
         run = self.program("log prior", lambda: Program(
-            lambda z, problem: traced.log_density(z, problem, remove_likelihood)))
+            lambda z, problem: unbound.log_density(z, problem, remove_likelihood)))
         return run(self._position(z), self.problem_of(y))
 
     def site_log_priors(self, trace: Mapping[str, Any]) -> dict[str, jax.Array]:
@@ -322,10 +323,10 @@ class BoundModel:
 
     def _target(self, jacobian: bool) -> Callable[[jax.Array, Any], jax.Array]:
         """Return the log density of unconstrained or of constrained parameters, a function of z and a `Problem`."""
-        traced = self.traced
+        unbound = self.unbound
         if jacobian:
-            return traced.log_density
-        return traced.constrained_log_density
+            return unbound.log_density
+        return unbound.constrained_log_density
 
     def log_density_with(self, handler: Callable[[Callable], Callable], z: ArrayLike,
                          y: ArrayLike | None = None) -> jax.Array:
@@ -336,23 +337,23 @@ class BoundModel:
             z: (d,).
             y: as in `log_density`.
         """
-        return self.traced.log_density(jnp.asarray(z, float), self._with_data(self.constants, y), handler)
+        return self.unbound.log_density(jnp.asarray(z, float), self._with_data(self.constants, y), handler)
 
     # --- parameters
 
     def unravel(self, z: ArrayLike) -> dict[str, jax.Array]:
         """Return the unconstrained values of each site: the ``init_params`` of ``MCMC.run``."""
-        return self.traced.unravel(jnp.asarray(z, float))
+        return self.unbound.unravel(jnp.asarray(z, float))
 
     def constrain(self, z: ArrayLike, y: ArrayLike | None = None) -> dict[str, jax.Array]:
         """Return site name -> value of the latent and the deterministic sites at z (d,)."""
-        run = self.program("constrain", lambda: Program(self.traced.constrain))
+        run = self.program("constrain", lambda: Program(self.unbound.constrain))
         return run(self._position(z), self.problem_of(y))
 
     def constrain_draws(self, z: ArrayLike) -> dict[str, np.ndarray]:
         """Return site name -> values (..., *shape) at draws z (..., d)."""
-        traced = self.traced
-        run = self.program("constrain draws", lambda: Program(jax.vmap(traced.constrain, in_axes=(0, None))))
+        unbound = self.unbound
+        run = self.program("constrain draws", lambda: Program(jax.vmap(unbound.constrain, in_axes=(0, None))))
         values = run(jnp.asarray(z, float).reshape(-1, self.size), self.problem)
         return {name: np.asarray(value).reshape(*np.shape(z)[:-1], *value.shape[1:]) for name, value in values.items()}
 
@@ -371,7 +372,7 @@ class BoundModel:
         for name in self.sites:
             if name not in values:
                 raise ValueError(f"values has no value of {name!r}; it needs one for each of {', '.join(self.sites)}.")
-        z, trace = self.traced.unconstrain(values, self.constants)
+        z, trace = self.unbound.unconstrain(values, self.constants)
         for name, site in trace.items():
             expected = tuple(site["fn"].batch_shape) + tuple(site["fn"].event_shape)
             if np.shape(values[name]) != expected:
@@ -383,12 +384,12 @@ class BoundModel:
 
     def draw(self, key: jax.Array, strategy: Callable = init_to_median) -> np.ndarray:
         """Return a point z (d,) by a NumPyro initialisation strategy."""
-        traced, problem = self.traced, self.problem
+        unbound, problem = self.unbound, self.problem
         if strategy not in _SITEWISE_STRATEGIES or problem.data is None or checks.traced(problem):
-            return np.asarray(traced.draw(key, self.constants, strategy), float)
+            return np.asarray(unbound.draw(key, self.constants, strategy), float)
         # With many data sets of one shape, running the model in Python would take longer than everything else.
         run = self.program(("draw", strategy), lambda: Program(
-            lambda key, problem: traced.draw(key, problem, strategy)))
+            lambda key, problem: unbound.draw(key, problem, strategy)))
         return np.asarray(run(key, problem), float)
 
     def probes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -423,14 +424,14 @@ class BoundModel:
         if self._trace is not None:
             return self._trace
         with jax.ensure_compile_time_eval():  # the call may come from compiled code
-            trace = self.traced.trace(self.constants)
+            trace = self.unbound.trace(self.constants)
         if not checks.traced(self.model_data):
             self._trace = trace
         return trace
 
     def trace_at(self, values: Mapping[str, Any], y: Any = None) -> dict[str, Any]:
         """Return NumPyro's trace of the model at values of its sites; ``y`` as in `log_density`."""
-        return self.traced.trace_at(values, self._with_data(self.constants, y))
+        return self.unbound.trace_at(values, self._with_data(self.constants, y))
 
     def site_of(self, trace: Mapping[str, Any]) -> LikelihoodSite:
         """Return the likelihood site of a result of `trace_at`, with its observations."""
@@ -450,9 +451,9 @@ class BoundModel:
 
     def _site_at(self, z: Any, problem: Problem) -> LikelihoodSite:
         """Return the likelihood site at parameters, with its observations."""
-        traced = self.traced
-        values = z if isinstance(z, Mapping) else traced.constrain(jnp.asarray(z, float), problem)
-        return self.site_of(traced.trace_at({name: values[name] for name in self.sites if name in values}, problem))
+        unbound = self.unbound
+        values = z if isinstance(z, Mapping) else unbound.constrain(jnp.asarray(z, float), problem)
+        return self.site_of(unbound.trace_at({name: values[name] for name in self.sites if name in values}, problem))
 
     def filter(self, z: ArrayLike | Mapping[str, Any], y: ArrayLike | None = None) -> FilterResult:
         """Return the result of the Gaussian filter at parameters z (d,), or site name -> value; see `lfm_ppl.filter`.
@@ -541,7 +542,7 @@ class BoundModel:
     def _has_fixed_grid(self, site: str) -> bool:
         """Whether no time of the grid of a likelihood depends on the parameters, as far as that is known."""
         layout = self.problem.grids[site].layout if site in self.problem.grids else None
-        is_wrapped = not isinstance(self.traced.at_medians[site]["fn"], Likelihood)
+        is_wrapped = not isinstance(self.unbound.at_medians[site]["fn"], Likelihood)
         return not is_wrapped and not (layout is not None and any(layout.is_lagged + layout.is_event_lagged))
 
     def with_all_sites(self) -> BoundModel:
@@ -591,7 +592,7 @@ class BoundModel:
         key = self.site.name, times.tobytes()
         if key not in self._layouts:
             with jax.ensure_compile_time_eval():  # the call may come from compiled code
-                self._layouts[key] = Partition.of_layout(self.traced.lay_out(self.site.name, self.constants, times))
+                self._layouts[key] = Partition.of_layout(self.unbound.lay_out(self.site.name, self.constants, times))
         return self._layouts[key]
 
     def _warn_of_long_steps(self, log_likelihood: Any, z: Any, y: Any, requested_times: Any = None) -> None:
@@ -646,7 +647,7 @@ class BoundModel:
                 modified = modified._with_checked_data(self.model_data)
             return modified._anchored_as(self)
         programs = Programs() if name[1] is None else self.programs.of_modified(key)
-        modified = BoundModel.of(modify(self.model), *self.constants.call(), self.traced.caller, programs,
+        modified = BoundModel.of(modify(self.model), *self.constants.call(), self.unbound.caller, programs,
                                  self._selected)
         if name[1] is not None and modified.problem.data is not None and not checks.traced(self.problem):
             self._modifications[key] = modified

@@ -19,7 +19,7 @@ import numpy as np
 
 from lfm_ppl.filtering.grid_layout import GridLayout
 from lfm_ppl.filtering.iterated import Anchor
-from lfm_ppl.likelihoods.likelihood_site import SiteTimes
+from lfm_ppl.likelihoods.handlers.binding import SiteTimes
 from lfm_ppl.utils import checks
 
 _ARRAY, _DATA = object(), object()

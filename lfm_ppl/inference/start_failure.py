@@ -35,7 +35,7 @@ def start_failure(bound: BoundModel) -> str:
 
 def _site_failure(bound: BoundModel) -> str | None:
     """Return a sentence on the prior, factor or further observed site whose log density is not finite."""
-    likelihoods = {site.name for site in bound.traced.likelihoods}
+    likelihoods = {site.name for site in bound.unbound.likelihoods}
     for name, site in bound.trace().items():
         if site["type"] != "sample" or name in likelihoods:
             continue

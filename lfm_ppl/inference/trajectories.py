@@ -27,7 +27,8 @@ from lfm_ppl.inference.problem import Partition, Problem, signature
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood
 from lfm_ppl.model.observation_noise import expected_observation, noisy_observation, replicate, with_noise
 from lfm_ppl.model.observations.family import ObservationFamily
-from lfm_ppl.model.simulate import LONGEST_PRODUCT, input_breakpoints, simulate_missing_states
+from lfm_ppl.model.simulate import input_breakpoints
+from lfm_ppl.model.simulated_path import LONGEST_PRODUCT, simulate_missing_states
 from lfm_ppl.model.state_space import StateSpaceModel
 from lfm_ppl.model.stiff_simulation import warn_of_infinite_states
 from lfm_ppl.particles.particle_filter import ParticleSettings
@@ -90,7 +91,7 @@ def scores(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], particle
                      rows=rows, report=report, store=store)
 
 
-def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at: Any,
+def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], requested_times: Any,
                  particles: ParticleSettings | None = None, particle_steps: int | None = None, *,
                  report: Reporter | None = None, store: BatchStore | None = None) -> Any:
     """Draw one trajectory for each draw of the parameters, given the data, and new observations along it.
@@ -103,7 +104,8 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         key: a JAX random key.
         bound: the model and its data.
         draws: site name -> (S, ...).
-        at: (K,) times of the trajectories, or (B, K) for each series of a panel; None: the observation times.
+        requested_times: (K,) times of the trajectories, or (B, K) for each series of a panel; None: the observation
+            times.
         particles: settings of the particle smoother; None: the Gaussian smoother.
         particle_steps: integration steps of the particles between two observations; None: the model's.
         report: as in `map_draws`.
@@ -122,19 +124,19 @@ def trajectories(key: jax.Array, bound: BoundModel, draws: Mapping[str, Any], at
         ``output_points`` and ``noise_sd_points`` (S, ..., P, K, size), where these functions are not linear, at points
         of that distribution; and ``log_likelihood`` (S, ...).
     """
-    at = None if at is None else np.asarray(at, float)
-    if at is not None and np.array_equal(at, bound.times):
-        at = None
+    requested_times = None if requested_times is None else np.asarray(requested_times, float)
+    if requested_times is not None and np.array_equal(requested_times, bound.times):
+        requested_times = None
     is_stiff = bound.site.example.is_stiff
     settings = particles, particle_steps
-    paths = _paths(key, bound, draws, at, settings, is_stiff, report=report, store=store)
+    paths = _paths(key, bound, draws, requested_times, settings, is_stiff, report=report, store=store)
     if _PRODUCT not in paths:
         return paths
     if not is_stiff and np.max(paths[_PRODUCT], initial=0.0) > LONGEST_PRODUCT:
         # The store holds batches of paths with explicit steps.
-        paths = _paths(key, bound, draws, at, settings, True, report=report, store=None)
+        paths = _paths(key, bound, draws, requested_times, settings, True, report=report, store=None)
     del paths[_PRODUCT]
-    warn_of_infinite_states(paths["state"], bound.times if at is None else at,
+    warn_of_infinite_states(paths["state"], bound.times if requested_times is None else requested_times,
                             bound.site.example.ssm.model.state_names)
     return paths
 

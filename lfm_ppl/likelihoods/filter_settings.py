@@ -50,14 +50,16 @@ class FilterSettings:
         Raises:
             ValueError, TypeError: an argument out of its range, or iterations beside a tolerance.
         """
-        given = {name: value for name, value in arguments.items() if value is not None}
-        if "rule" in given:
-            given["rule"] = as_rule(given["rule"])
-        check_iterations(given.get("iterations"), given.get("damping", cls.damping), given.get("tolerance"))
-        if "tolerance" in given:
-            checks.positive("tolerance", given["tolerance"], "It is in standard deviations, 0.001 for example.")
-            given["tolerance"] = float(given["tolerance"])
-        checks.one_of("method", given.get("method", cls.method), METHODS)
-        if "factors" in given:
-            given["factors"] = as_settings(given["factors"])
-        return cls(**given), frozenset(given)
+        named_settings = {name: value for name, value in arguments.items() if value is not None}
+        if "rule" in named_settings:
+            named_settings["rule"] = as_rule(named_settings["rule"])
+        check_iterations(named_settings.get("iterations"), named_settings.get("damping", cls.damping),
+                         named_settings.get("tolerance"))
+        if "tolerance" in named_settings:
+            checks.positive("tolerance", named_settings["tolerance"],
+                            "It is in standard deviations, 0.001 for example.")
+            named_settings["tolerance"] = float(named_settings["tolerance"])
+        checks.one_of("method", named_settings.get("method", cls.method), METHODS)
+        if "factors" in named_settings:
+            named_settings["factors"] = as_settings(named_settings["factors"])
+        return cls(**named_settings), frozenset(named_settings)

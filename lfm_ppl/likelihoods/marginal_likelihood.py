@@ -118,11 +118,11 @@ class MarginalLikelihood(SeriesLikelihood):
         check_model(model)
         arguments = {"rule": rule, "steps": steps, "max_step": max_step, "iterations": iterations, "damping": damping,
                      "tolerance": tolerance, "method": method, "factors": factors}
-        settings, given = FilterSettings.of(arguments)
+        settings, setting_names = FilterSettings.of(arguments)
         if factors is not None and not isinstance(model.observation, ObservationFamily):
             raise ValueError("factors are for an observation family such as lfm.PoissonObservation; the observation of "
                              "this model is Gaussian, whose filter needs none. Leave out factors.")
-        super().__init__(model, times, settings, given)
+        super().__init__(model, times, settings, setting_names)
         self.settings = replace(settings, iterations=number_of_iterations(iterations, self.ssm, settings.tolerance))
         self.about = about if self.is_iterated else None
 

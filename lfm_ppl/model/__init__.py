@@ -1,1 +1,1 @@
-"""The latent force model, its observations, and its conversion to a state-space model."""
+"""The latent force model, its observations and events, its state-space form, and simulation of it."""

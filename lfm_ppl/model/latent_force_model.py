@@ -13,7 +13,7 @@ Source: Hartikainen, Seppänen and Särkkä (2012), ICML, section 3.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -25,10 +25,19 @@ from lfm_ppl.forces.sde import Force
 from lfm_ppl.model.events import Event, Infusion
 from lfm_ppl.model.gaussian import Gaussian
 from lfm_ppl.model.inputs import Input, InputRead, check_reads, has_inputs, input_reads
+from lfm_ppl.model.model_arguments import (
+    check_types,
+    checked_dispersion,
+    checked_events,
+    checked_functions,
+    checked_names,
+    describe_shape,
+    forces_by_name,
+)
 from lfm_ppl.model.observation import GaussianObservation
 from lfm_ppl.model.observations.family import ObservationFamily
 from lfm_ppl.model.time_degree import degree_in_time
-from lfm_ppl.model.user_functions import TracedFunction, own_functions, trace
+from lfm_ppl.model.user_functions import TracedFunction, own_functions, trace_function
 from lfm_ppl.utils import checks
 
 _ROOTS = {"sqrt", "rsqrt", "cbrt", "pow"}
@@ -115,8 +124,8 @@ class LatentForceModel(eqx.Module):
         deterministics: Mapping[str, Callable[..., jax.Array]] | None = None,
         events: Sequence[Event] = (),
     ):
-        _check_types(dynamics, observation, initial_state)
-        self.force_names, self.forces = _forces_by_name(forces)
+        check_types(dynamics, observation, initial_state)
+        self.force_names, self.forces = forces_by_name(forces)
         self.dynamics, self.initial_state = own_functions(dynamics), initial_state
         self.observation = own_functions(observation.with_output_sizes(
             lambda function: self._trace_observation(function).shape.shape[0]))
@@ -126,18 +135,18 @@ class LatentForceModel(eqx.Module):
         concrete_time = None if initial_time is None else checks.concrete(initial_time)
         self.initial_time = initial_time if concrete_time is None else concrete_time.astype(float)
         size = initial_state.mean.shape[0]
-        self.state_names = _names("state_names", state_names, size, "x")
+        self.state_names = checked_names("state_names", state_names, size, "x")
         if overlap := set(self.state_names) & set(self.force_names):
             raise ValueError(f"the name {sorted(overlap)[0]!r} is used for a state and for a force; rename one.")
-        self.events = _events(events, self.state_names)
+        self.events = checked_events(events, self.state_names)
         self.infusions = tuple((event.direction_in(self.state_names), event.rate_of_change())
                                for event in self.events if isinstance(event, Infusion) and len(event.times))
         self.process_noise = own_functions(process_noise if callable(process_noise)
-                                           else _dispersion(process_noise, size))
-        self.deterministics = own_functions(_functions(deterministics, {*self.state_names, *self.force_names}))
+                                           else checked_dispersion(process_noise, size))
+        self.deterministics = own_functions(checked_functions(deterministics, {*self.state_names, *self.force_names}))
         self.deterministic_names = tuple(self.deterministics)
         functions = self.traced_functions()
-        self.output_names = _names("output_names", output_names, functions["observation"].shape.shape[0], "y")
+        self.output_names = checked_names("output_names", output_names, functions["observation"].shape.shape[0], "y")
         if isinstance(self.observation, ObservationFamily):
             self.observation.check_shapes(len(self.output_names))
         self.unit_items = tuple(sorted((units or {}).items()))  # JAX sorts a dict that is an argument
@@ -177,18 +186,18 @@ class LatentForceModel(eqx.Module):
 
     def _trace_observation(self, function: Callable) -> TracedFunction:
         """Return a traced observation function; raise ValueError unless it returns a vector."""
-        traced = trace("the observation function", "h(x, u, t)", function, *self._arguments)
+        traced = trace_function("the observation function", "h(x, u, t)", function, *self._arguments)
         if len(getattr(traced.shape, "shape", ())) != 1:
-            raise ValueError(f"the observation function must return a vector (D,), got {_describe(traced.shape)}. For "
-                             "one output, return x[:1] or jnp.array([...]).")
+            raise ValueError(f"the observation function must return a vector (D,), got {describe_shape(traced.shape)}. "
+                             "For one output, return x[:1] or jnp.array([...]).")
         return traced
 
     def traced_functions(self) -> dict[str, TracedFunction]:
         """Return the traced functions of the model by name, after checks of their shapes and indices."""
         arguments, observation = self._arguments, self.observation
-        functions = {"dynamics": trace("dynamics", "f(x, u, t)", self.dynamics, *arguments)}
+        functions = {"dynamics": trace_function("dynamics", "f(x, u, t)", self.dynamics, *arguments)}
         if callable(self.process_noise):
-            functions["process_noise"] = trace("process_noise", "(x, u, t)", self.process_noise, *arguments)
+            functions["process_noise"] = trace_function("process_noise", "(x, u, t)", self.process_noise, *arguments)
         self._check_state_shapes(**functions)
         functions["observation"] = self._trace_observation(observation.function)
         (outputs,) = functions["observation"].shape.shape
@@ -199,10 +208,10 @@ class LatentForceModel(eqx.Module):
         if any(not 0 <= index < outputs for index in observation.angular):
             raise ValueError(f"angular indices must lie in 0..{outputs - 1}, got {observation.angular}.")
         if callable(observation.covariance):
-            functions["covariance"] = trace("the observation covariance", "(x, u, t)", observation.covariance,
-                                            *arguments)
+            functions["covariance"] = trace_function("the observation covariance", "(x, u, t)", observation.covariance,
+                                                     *arguments)
         for name, function in self.deterministics.items():
-            traced = trace(f"the deterministic {name!r}", "(x, u, t)", function, *arguments)
+            traced = trace_function(f"the deterministic {name!r}", "(x, u, t)", function, *arguments)
             shape = getattr(traced.shape, "shape", traced.shape)
             if shape != ():
                 raise ValueError(f"{traced.label} must return one number, shape (); it returned {shape}. The entry of "
@@ -210,7 +219,8 @@ class LatentForceModel(eqx.Module):
             functions[f"deterministic {name}"] = traced
         for traced in functions.values():
             traced.check_indices(("x", "u"))
-        means = {f"mean of {name}": trace(f"the mean of the force {name!r}", "(t)", force.mean_at, arguments[2])
+        means = {f"mean of {name}": trace_function(f"the mean of the force {name!r}", "(t)", force.mean_at,
+                                                  arguments[2])
                  for name, force in self.forces.items() if callable(force.mean)}
         return functions | means
 
@@ -219,7 +229,7 @@ class LatentForceModel(eqx.Module):
         size, shape = self.initial_state.mean.shape[0], getattr(dynamics.shape, "shape", None)
         if shape != (size,):
             raise ValueError(f"dynamics must return one derivative for each of the {size} entries of "
-                             f"initial_state.mean, shape ({size},); it returned {_describe(dynamics.shape)}."
+                             f"initial_state.mean, shape ({size},); it returned {describe_shape(dynamics.shape)}."
                              f"{'' if shape else ' Return jnp.array([...]).'}")
         noise: tuple[int, ...] = (size, 0) if process_noise is None else getattr(process_noise.shape, "shape", ())
         if len(noise) != 2 or noise[0] != size:
@@ -330,94 +340,6 @@ def _integrated_functions(functions: Mapping[str, TracedFunction]) -> list[Trace
     """Return the functions that are evaluated between observations."""
     return [function for name, function in functions.items()
             if name in ("dynamics", "process_noise") or name.startswith("mean of ")]
-
-
-def _functions(deterministics: Mapping[str, Callable] | None, used_names: set[str]) -> dict[str, Callable]:
-    """Return the deterministics after checks of their types and names."""
-    deterministics = {} if deterministics is None else deterministics
-    if not isinstance(deterministics, Mapping):
-        raise TypeError("deterministics must be a mapping, name -> function (x, u, t), got "
-                        f"{type(deterministics).__name__}.")
-    for name, function in deterministics.items():
-        if not callable(function):
-            raise TypeError(f"the deterministic {name!r} must be a function (x, u, t), got {type(function).__name__}.")
-        if name in used_names:
-            raise ValueError(f"the name {name!r} of a deterministic is used for a state or a force; rename one.")
-    return {str(name): function for name, function in deterministics.items()}
-
-
-def _check_types(dynamics: Any, observation: Any, initial_state: Any) -> None:
-    if not callable(dynamics):
-        raise TypeError(f"dynamics must be callable as f(x, u, t), got {type(dynamics).__name__}.")
-    if not isinstance(observation, (GaussianObservation, ObservationFamily)):
-        raise TypeError("observation must be an lfm.GaussianObservation, or a family such as lfm.PoissonObservation, "
-                        f"got {type(observation).__name__}. Wrap the function: "
-                        "lfm.GaussianObservation(lambda x, u, t: x, sd=0.1).")
-    if not isinstance(initial_state, Gaussian):
-        raise TypeError(f"initial_state must be an lfm.Gaussian, got {type(initial_state).__name__}.")
-
-
-def _describe(result: Any) -> str:
-    """Return a description of the result of a function that should have returned a vector."""
-    if hasattr(result, "shape"):
-        return f"{'an array' if result.shape else 'a number'} of shape {result.shape}"
-    if isinstance(result, (list, tuple)):
-        return f"a {type(result).__name__} of {len(result)}, which is not an array"
-    return "None, as a function without `return` does" if result is None else type(result).__name__
-
-
-def _forces_by_name(forces: Any) -> tuple[tuple[str, ...], dict[str, Force]]:
-    if isinstance(forces, Force) or not isinstance(forces, Iterable):
-        raise TypeError('forces must map names to forces, for example {"p53": lfm.Matern(1.0, 2.0)}, or {} for none; '
-                        f"got {type(forces).__name__}.")
-    items = list(forces.items()) if isinstance(forces, Mapping) else list(forces)
-    for item in items:
-        if not (isinstance(item, tuple) and len(item) == 2 and isinstance(item[0], str)):
-            raise TypeError('forces must map names to forces, for example {"p53": lfm.Matern(1.0, 2.0)}; '
-                            f"got {item!r}.")
-        if not isinstance(item[1], Force):
-            raise TypeError(f"the force {item[0]!r} must be a force such as lfm.Matern, got {type(item[1]).__name__}.")
-    names = tuple(name for name, _ in items)
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"the force name {name!r} repeats; every force needs a different name.")
-    return names, dict(items)
-
-
-def _names(argument: str, names: Sequence[str] | None, size: int, prefix: str) -> tuple[str, ...]:
-    """Return ``size`` names after a check of their number; None: ``prefix`` with numbers."""
-    if names is None:
-        return tuple(f"{prefix}{index}" for index in range(size))
-    if isinstance(names, str) or len(names) != size:
-        names = (names,) if isinstance(names, str) else tuple(names)
-        source = {"output_names": "the observation returns", "state_names": "initial_state.mean has"}.get(argument)
-        reason = f": {source} {size} {'entry' if size == 1 else 'entries'}" if source else ""
-        raise ValueError(f"{argument} must hold {size} {'name' if size == 1 else 'names'}{reason}. It holds "
-                         f"{', '.join(map(repr, names)) or 'none'}.")
-    if len(set(names)) != size:
-        raise ValueError(f"{argument} must not repeat, got {tuple(names)}.")
-    return tuple(str(name) for name in names)
-
-
-def _events(events: Sequence[Event], state_names: Sequence[str]) -> tuple[Event, ...]:
-    events = (events,) if isinstance(events, Event) else tuple(events)
-    for event in events:
-        if not isinstance(event, Event):
-            raise TypeError("events must contain lfm.Dose, lfm.Infusion and lfm.Reset, got "
-                            f"{type(event).__name__}.")
-        event.check_target(state_names)
-    return events
-
-
-def _dispersion(value: Any, size: int) -> jax.Array | None:
-    if value is None:
-        return None
-    checks.finite("process_noise", value)
-    value = jnp.asarray(value, float)
-    if value.ndim != 2 or value.shape[0] != size:
-        raise ValueError(f"process_noise must be a dispersion matrix ({size}, S), one row for each state, got shape "
-                         f"{value.shape}. For independent noises use jnp.diag(standard_deviations).")
-    return value
 
 
 def _concrete(values: Any) -> Any:

@@ -3,7 +3,7 @@
 An index out of range raises in NumPy. Compiled code cannot raise: JAX uses the nearest entry instead, and the
 likelihood of ``u[7]`` is finite for a model of one force.
 
-1. `trace` traces a function once; its errors explain how to rewrite functions that cannot be traced.
+1. `trace_function` traces a function once; its errors explain how to rewrite functions that cannot be traced.
 2. `_walk` yields the equations of a jaxpr and of the functions it calls, with the values of operands that are
    constants, known arguments, or computed from these.
 3. `TracedFunction.check_indices` compares known indices of slices, gathers and scatters with the shapes of the arrays.
@@ -164,7 +164,7 @@ def own_functions(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: own_function(leaf) if callable(leaf) else leaf, tree)
 
 
-def trace(label: str, form: str, function: Callable, *arguments: Any) -> TracedFunction:
+def trace_function(label: str, form: str, function: Callable, *arguments: Any) -> TracedFunction:
     """Trace a user's function once.
 
     Args:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from lfm_ppl.io.input_table import InputTable
 from lfm_ppl.plots import forecasts, style
-from lfm_ppl.plots.trajectories import MAX_PANELS, finish
+from lfm_ppl.plots.panels import MAX_PANELS, finish
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.utils.checks import one_of
 

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from lfm_ppl.plots import style
-from lfm_ppl.plots.trajectories import finish, pick, series_views
+from lfm_ppl.plots.panels import finish, pick, series_views
 from lfm_ppl.results.residuals import autocorrelation, default_lags, mean_residuals, normal_scores, residual_tests
 from lfm_ppl.results.result_view import ResultView
 

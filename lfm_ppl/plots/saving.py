@@ -11,7 +11,18 @@ from typing import Any
 from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 
-from lfm_ppl.plots import accuracy, chains, fields, forecasts, inputs, pairs, residuals, trajectories
+from lfm_ppl.plots import (
+    accuracy,
+    chains,
+    fields,
+    fit_to_data,
+    forecasts,
+    inputs,
+    pairs,
+    panels,
+    residuals,
+    trajectories,
+)
 from lfm_ppl.results.fields import GROUP as FIELD
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.scalars import sampled
@@ -20,7 +31,7 @@ from lfm_ppl.utils.atomic_files import atomic_write, refuse_existing
 MAX_PAGES = 5
 Draw = Callable[..., Figure]
 _OVER_TIME: dict[str, Draw] = {
-    "fit": trajectories.plot_fit, "inputs": inputs.plot_inputs, "forces": trajectories.plot_forces,
+    "fit": fit_to_data.plot_fit, "inputs": inputs.plot_inputs, "forces": trajectories.plot_forces,
     "deterministics": trajectories.plot_deterministics, "states": trajectories.plot_states,
 }
 
@@ -93,7 +104,7 @@ def pages_of(result: Any, width: str | float) -> Iterator[tuple[str, Draw, Any]]
                 continue
             title = f"{prefix}{kind}".replace("forecast-fit", "forecast")
             draw = draw if prefix or not later else _of_the_fit(draw)
-            yield from _pages(title, draw, names, trajectories.MAX_PANELS, series if kind != "inputs" else [])
+            yield from _pages(title, draw, names, panels.MAX_PANELS, series if kind != "inputs" else [])
     for name in (name.removeprefix(FIELD) for name in view.groups if name.startswith(FIELD)):
         yield f"field-{name}", fields.plot_field, name
     if "posterior" in view.groups:
@@ -133,7 +144,7 @@ def _pages(title: str, draw: Draw, names: list[str], size: int,
     def draw_series(view: ResultView, page: Sequence[Any], **options: Any) -> Figure:
         return draw(view, names[:size], series=page, **options)
 
-    yield from _numbered(title, draw_series, series, trajectories.MAX_PANELS // min(size, len(names)))
+    yield from _numbered(title, draw_series, series, panels.MAX_PANELS // min(size, len(names)))
 
 
 def _numbered(title: str, draw: Draw, names: Sequence[Any], size: int) -> Iterator[tuple[str, Draw, list[Any]]]:

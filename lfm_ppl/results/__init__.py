@@ -1,1 +1,1 @@
-"""What to do with a result: keep it, summarise it, check it, draw it."""
+"""Results: ArviZ containers, their files, summaries, scores and tables."""

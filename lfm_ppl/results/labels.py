@@ -56,7 +56,7 @@ class Labels:
         series = plate_dimension(bound)
         plates = [frame.name for frame in trace[site.name].get("cond_indep_stack", ())]
         renamed = {plates[0]: series} if series is not None and len(plates) == 1 else {}
-        likelihoods = {likelihood.name for likelihood in bound.traced.likelihoods}
+        likelihoods = {likelihood.name for likelihood in bound.unbound.likelihoods}
         dimensions = {name: _axes(site_trace, renamed) for name, site_trace in trace.items()
                       if name not in likelihoods and site_trace["type"] in ("sample", "deterministic")}
         derived = frozenset(name for name in dimensions if trace[name]["type"] == "deterministic")

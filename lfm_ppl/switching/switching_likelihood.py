@@ -148,8 +148,9 @@ class Switching(SeriesLikelihood):
         self.rates = check_rates(rates, count)
         self.initial = check_probabilities(jnp.full(count, 1.0 / count) if initial is None else initial, count)
         self.merging = merging
-        settings, given = FilterSettings.of({"rule": rule, "steps": steps, "max_step": max_step, "method": method})
-        super().__init__(joint_model(by_name, self.initial), times, settings, given)
+        settings, setting_names = FilterSettings.of(
+            {"rule": rule, "steps": steps, "max_step": max_step, "method": method})
+        super().__init__(joint_model(by_name, self.initial), times, settings, setting_names)
 
     @property
     def has_gaussian_state(self) -> bool:

@@ -9,5 +9,5 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 def shipped_folder(name: str) -> Path:
     """Return the folder ``name`` of the checkout, ``models`` or ``studies``; in a wheel, ``_name`` in the package."""
-    inside = _PACKAGE / f"_{name}"
-    return inside if inside.is_dir() else _PACKAGE.parent / name
+    packaged_folder = _PACKAGE / f"_{name}"
+    return packaged_folder if packaged_folder.is_dir() else _PACKAGE.parent / name

@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lfm_ppl.inference.bound_model import BoundModel
-from lfm_ppl.inference.trace import SharedModel
+from lfm_ppl.inference.unbound_model import SharedModel
 from lfm_ppl.io.data import as_data
 from lfm_ppl.results.family_scores import log_densities
 from lfm_ppl.results.predictions import GROUP, MEAN, SD, flat_draws, observed_variable

@@ -13,8 +13,8 @@ from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.problem import signature
-from lfm_ppl.inference.trace import SharedModel
 from lfm_ppl.inference.trajectories import has_noise_of_rows
+from lfm_ppl.inference.unbound_model import SharedModel
 from lfm_ppl.io.data import as_data
 from lfm_ppl.io.data_set import Data, at_origin
 from lfm_ppl.io.input_table import keywords_by_site, model_keywords
@@ -110,9 +110,11 @@ def bind_data(numpyro_model: Callable, times: Any, y: Any, model_kwargs: Mapping
     is_by_site = passed is not None
     if passed is None:
         passed = {"": as_data(times) if y is None else (times, y)}
-    own = {name: _Record.of(value, f"times[{name!r}]" if is_by_site else "times") for name, value in passed.items()}
-    origin, unit = _common_clock(own)
-    records = own if origin is None else {name: record.on_clock(origin, unit) for name, record in own.items()}
+    records = {name: _Record.of(value, f"times[{name!r}]" if is_by_site else "times")
+               for name, value in passed.items()}
+    origin, unit = _common_clock(records)
+    if origin is not None:
+        records = {name: record.on_clock(origin, unit) for name, record in records.items()}
 
     def bind_records(records: Mapping[str, _Record], unit: str) -> BoundModel:
         with calendar_time.in_messages(origin, unit):
@@ -163,9 +165,9 @@ def _in_units_of(bound: BoundModel, records: Mapping[str, _Record], origin: str 
     """
     models = bound.site_models
     named = {name: models.get(name, bound).site.example.ssm.model.units.get("time", "") for name in records}
-    known = [name for name in named.values() if name in calendar_time.SECONDS]
+    time_units = [name for name in named.values() if name in calendar_time.SECONDS]
     if origin is not None:
-        unit = known[0] if known else unit
+        unit = time_units[0] if time_units else unit
         return unit, {name: record.on_clock(origin, unit) for name, record in records.items()}
     first = next((record.unit for record in records.values() if record.unit in calendar_time.SECONDS), "")
     converted = {name: record.on_clock(None, named[name] or first) for name, record in records.items()}

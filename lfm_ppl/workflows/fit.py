@@ -2,7 +2,8 @@
 
 1. Bind the model to its data, and check every argument.
 2. Find the sampler and the starting points (`lfm_ppl.workflows.fit_starts`).
-3. Run the chains (`lfm_ppl.inference.sampling`), or find the posterior mode and draw from its Laplace approximation.
+3. Run the chains (`lfm_ppl.inference.sampling`), or find the posterior mode and draw from its Laplace approximation
+   (both in `lfm_ppl.workflows.posterior_draws`).
 4. Compute scores, diagnostics and trajectories from the draws (`lfm_ppl.workflows.fit_results`).
 5. Build the result, store it, and raise its warnings.
 
@@ -14,11 +15,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,25 +29,17 @@ from numpy.typing import ArrayLike
 
 from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.inference import sampling
-from lfm_ppl.inference.bound_model import BoundModel, StartError
-from lfm_ppl.inference.degenerate_mode import degenerate_entries
+from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.kernels.options import check_options
-from lfm_ppl.inference.long_steps import long_step_messages
-from lfm_ppl.inference.map import check_sites, mode_of
 from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.samplers import SAMPLERS
-from lfm_ppl.inference.schedule import Schedule
-from lfm_ppl.inference.start_failure import start_failure
 from lfm_ppl.linearisation.rule import Rule
-from lfm_ppl.results import arviz_data
 from lfm_ppl.results.labels import Labels
 from lfm_ppl.results.series import SERIES
 from lfm_ppl.results.true_values import checked_truth
 from lfm_ppl.storage import checkpoint as checkpoints
-from lfm_ppl.storage.checkpoint import Checkpoint
 from lfm_ppl.utils import calendar_time, checks
 from lfm_ppl.utils.compilation import prepare_chains
-from lfm_ppl.utils.progress import waiting
 from lfm_ppl.utils.types import Result, Times
 from lfm_ppl.workflows.data_binding import (
     SiteData,
@@ -70,8 +62,6 @@ from lfm_ppl.workflows.fit_options import (
 from lfm_ppl.workflows.fit_results import (
     ConvergenceWarning,
     FitProblem,
-    PosteriorDraws,
-    PostProcessing,
     SiteProblem,
     best_effort,
     build_result,
@@ -80,16 +70,7 @@ from lfm_ppl.workflows.fit_results import (
     post_process,
     write_result,
 )
-from lfm_ppl.workflows.fit_starts import FALLBACK, ChainStart, check_init, find_start
-
-_MODE = "mode"
-"""Name of the mode and its draws in the folder of a run."""
-
-_ATTRIBUTES, _DRAWS = "attributes", "draws/"
-"""Entry of the attributes among the arrays of a mode, and prefix of the entries of its draws."""
-
-_MODE_SEARCH = "posterior mode: compiling and searching"
-_START_SEARCH = "start: compiling and searching for starting points"
+from lfm_ppl.workflows.posterior_draws import draw_about_mode, explain_start_failure, find_chain_start, sample_chains
 
 
 def fit(
@@ -283,15 +264,15 @@ def fit(
         **likelihood_settings(site_model.site.example),
         "assumptions": best_effort("the model in words", functools.partial(describe_assumptions, site_model), None),
     }) for name, site_model in bound.site_models.items()}
-    requested = {name: site.requested_times for name, site in sites.items()}
-    at = None if at is None else requested if bound.is_by_site else requested[bound.site.name]
+    times_by_site = {name: site.requested_times for name, site in sites.items()}
+    requested_times = None if at is None else times_by_site if bound.is_by_site else times_by_site[bound.site.name]
     if sampler == "map":
         chains, warmup, thin, method_of_chains = 1, 0, None, None
     else:
         thin = thin or SAMPLERS[sampler].steps_per_draw * bound.size or 1
         method_of_chains = sampling.available_method(chain_method, chains)
-    options = FitOptions(sampler, chains, warmup, samples, thin, seed, dict(fixed or {}), at, trajectory_draws, init,
-                         dict(sampler_options or {}), method_of_chains, settings)
+    options = FitOptions(sampler, chains, warmup, samples, thin, seed, dict(fixed or {}), requested_times,
+                         trajectory_draws, init, dict(sampler_options or {}), method_of_chains, settings)
     title = str(name or getattr(numpyro_model, "__name__", "model"))
     description = {
         "model": title, "description": model_docstring(numpyro_model),
@@ -313,14 +294,14 @@ def fit(
                   f"{chains} chains side by side. Call numpyro.set_host_device_count({chains}) before it computes.",
                   file=sys.stderr, flush=True)
     with contextlib.closing(store) if store else contextlib.nullcontext(), calendar_time.in_messages(*clock):
-        with _explain_start_failure(bound):
+        with explain_start_failure(bound):
             if sampler == "map":
-                draws = _draw_about_mode(problem, store, progress)
+                draws = draw_about_mode(problem, store, progress)
             else:
-                start = _find_start(problem, store, progress)
+                start = find_chain_start(problem, store, progress)
                 if start.sampler.bound is not problem.bound:
                     problem = problem.with_bound(start.sampler.bound)
-                draws = _sample(problem, start, store, progress)
+                draws = sample_chains(problem, start, store, progress)
         processed = post_process(problem, draws, store, progress)
         partial = draws.partial or processed.partial
         result = build_result(problem, draws, processed, store, partial)
@@ -342,26 +323,27 @@ def fit(
     return result
 
 
-def _site_problem(bound: BoundModel, site_data: SiteData, clock: tuple[str | None, str], at: Any,
+def _site_problem(bound: BoundModel, site_data: SiteData, clock: tuple[str | None, str], requested_times: Any,
                   truth: Mapping[str, Any] | None, dims: Mapping[str, Sequence[str]] | None,
                   coords: Mapping[str, Sequence[Any]] | None) -> SiteProblem:
     """Check the arguments of `fit` on one likelihood site."""
     data, unit = site_data.on_clock, site_data.unit
     if clock[0] is None and data is not None:  # each site may have a unit of its own
         clock = None, data.units.get("time", "")
-    if calendar_time.holds_dates(at):
-        at = calendar_time.positions("at", at, *clock)
-    elif at is not None and unit is not None and unit != clock[1]:  # numbers in the unit of the user's data
-        checks.refuse_durations("at", at)
-        at = np.asarray(at, float) * (calendar_time.SECONDS[unit] / calendar_time.SECONDS[clock[1]])
+    if calendar_time.holds_dates(requested_times):
+        requested_times = calendar_time.positions("at", requested_times, *clock)
+    elif requested_times is not None and unit is not None and unit != clock[1]:  # in the user's unit
+        checks.refuse_durations("at", requested_times)
+        requested_times = np.asarray(requested_times, float) * (calendar_time.SECONDS[unit]
+                                                                / calendar_time.SECONDS[clock[1]])
     with calendar_time.in_messages(*clock):
-        check_requested_times(bound, at)
-        warn_of_missing_predictions(bound, at)
+        check_requested_times(bound, requested_times)
+        warn_of_missing_predictions(bound, requested_times)
     if data is not None:
         coords = {"output": data.outputs, **({SERIES: data.series} if data.series else {}), **(coords or {})}
     labels = Labels.of(bound, dims, coords, site_data.labelled_y)
     truth = data.truth if truth is None and data is not None else truth
-    return SiteProblem(bound, labels, at, data, clock, checked_truth(bound, truth, labels))
+    return SiteProblem(bound, labels, requested_times, data, clock, checked_truth(bound, truth, labels))
 
 
 class _StoppedError(KeyboardInterrupt):
@@ -376,120 +358,3 @@ class _StoppedError(KeyboardInterrupt):
         self.result = result
 
 
-@contextlib.contextmanager
-def _explain_start_failure(bound: BoundModel) -> Iterator[None]:
-    """Add the part of the density that fails at the prior median to the error of a failed search for a start."""
-    try:
-        yield
-    except StartError as error:
-        reason = best_effort("reason why there is nowhere to start", lambda: start_failure(bound), None)
-        if reason is None:
-            raise
-        raise ValueError(f"{error} At the prior median, {reason}") from error
-
-
-def _find_start(problem: FitProblem, store: Checkpoint | None, show_progress: bool) -> ChainStart:
-    """Find the sampler and the starting points, or read what a resumed run found."""
-    bound, options = problem.bound, problem.options
-    setup = store.setup if store is not None and store.has_state else None
-    text = _MODE_SEARCH if options.init in (None, "map") else _START_SEARCH
-    with waiting(text, show_progress and setup is None):
-        start = find_start(bound, options, setup)
-    if show_progress and setup is None and FALLBACK in start.attributes:
-        print(f"note     {start.attributes[FALLBACK]}", file=sys.stderr, flush=True)
-    for name, tuning in start.tunings.items() if show_progress else ():
-        print(f"likelihood: {f'{name}: ' if bound.is_by_site else ''}{tuning}", file=sys.stderr, flush=True)
-    if start.points is not None:
-        _warn_of_long_steps(problem, start.points[0] if start.mode is None else start.mode)
-    if store is not None and setup is None:
-        store.setup = start.setup
-    return start
-
-
-def _sample(problem: FitProblem, start: ChainStart, store: Checkpoint | None, show_progress: bool) -> PosteriorDraws:
-    """Run the chains; after Ctrl-C, return the finished draws.
-
-    Raises:
-        KeyboardInterrupt: there are no draws.
-    """
-    bound, options = problem.bound, problem.options
-    assert options.thin is not None
-    attributes = {**start.attributes, "thin": options.thin}
-    if store is not None:
-        store.write_partial = _partial_result_writer(problem, attributes, store)
-    schedule = Schedule(start.attributes["warmup"] * options.thin, options.samples, options.thin, options.chain_method)
-    chains = sampling.run_chains(options.keys["chains"], start.sampler, start.points, schedule, store, show_progress)
-    count = chains.z.shape[1]
-    if count == 0:
-        raise KeyboardInterrupt(f"stopped in the warm-up, after {chains.done:,} of {chains.total:,} steps; there are "
-                                "no draws yet")
-    partial = _number_of_draws(count, options.samples) if chains.done < chains.total else None
-    values, statistics = _constrained_draws(bound, {"z": chains.z, **chains.statistics}, options.samples)
-    return PosteriorDraws(values, statistics, chains.z, attributes, start.particle_options, partial)
-
-
-def _warn_of_long_steps(problem: FitProblem, z: np.ndarray) -> None:
-    """Warn, before the sampling, of steps that are too long for a fast decay at the start or the mode z (d,)."""
-    has_method = problem.options.sampler != "pmmh"
-    messages = best_effort("check of the steps", lambda: long_step_messages(problem.bound, z, has_method), [])
-    for message in messages:
-        checks.warn(message, ApproximationWarning)
-
-
-def _partial_result_writer(problem: FitProblem, attributes: dict[str, Any],
-                           store: Checkpoint) -> Callable[[Mapping[str, np.ndarray]], None]:
-    """Return the function that writes a result of the first draws during the run."""
-    samples = problem.options.samples
-
-    def write(rows: Mapping[str, np.ndarray]) -> None:
-        values, statistics = _constrained_draws(problem.bound, rows, samples)
-        draws = PosteriorDraws(values, statistics, None, attributes)
-        partial = _number_of_draws(rows["z"].shape[1], samples)
-        write_result(store, build_result(problem, draws, PostProcessing(), store, partial))
-
-    return lambda rows: best_effort("partial result", lambda: write(rows), None)
-
-
-def _number_of_draws(count: int, samples: int) -> str:
-    return f"{count} of {samples} draws a chain, without scores and trajectories"
-
-
-def _constrained_draws(bound: BoundModel, rows: Mapping[str, np.ndarray], samples: int) -> tuple[dict, dict]:
-    """Return site name -> draws, and the statistics, from the rows that the chains recorded."""
-    z = rows["z"]
-    count = z.shape[1]
-    # Padded to the full number of draws, so that one program serves every number.
-    padded = np.concatenate([z, np.repeat(z[:, -1:], samples - count, axis=1)], axis=1)
-    values = {site: draws[:, :count] for site, draws in bound.constrain_draws(padded).items()}
-    statistics = {name: row for name, row in rows.items() if name != "z"} | {"lp": -rows["lp"]}
-    if "n_steps" in statistics:
-        statistics["tree_depth"] = np.ceil(np.log2(statistics["n_steps"] + 1)).astype(int)
-    return values, statistics
-
-
-def _draw_about_mode(problem: FitProblem, store: Checkpoint | None, show_progress: bool) -> PosteriorDraws:
-    """Return draws from the Laplace approximation at the posterior mode."""
-    bound, options = problem.bound, problem.options
-    if isinstance(options.init, Mapping):
-        check_sites(bound, options.init)
-    else:
-        check_init(options.init)
-
-    def compute() -> dict[str, Any]:
-        mode = mode_of(options.keys["mode"], bound, init=None if isinstance(options.init, str) else options.init)
-        _warn_of_long_steps(problem, mode.mode)
-        attributes = {"map_converged": int(mode.converged), "map_message": mode.message,
-                      "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence),
-                      arviz_data.MODE: json.dumps({name: value.tolist() for name, value in
-                                                   {**mode.parameters, **mode.deterministic}.items()})}
-        draws = mode.sample(options.keys["chains"], options.samples)
-        degenerate = best_effort("check of the mode", lambda: degenerate_entries(bound, mode, draws), {})
-        attributes |= {arviz_data.DEGENERATE: json.dumps(degenerate)} if degenerate else {}
-        return {_ATTRIBUTES: np.asarray(json.dumps(attributes)),
-                **{f"{_DRAWS}{name}": values for name, values in draws.items()}}
-
-    with waiting(_MODE_SEARCH, show_progress and not (store is not None and store.has(_MODE))):
-        arrays = compute() if store is None else store.get_or_compute(_MODE, compute)
-    values = {name.removeprefix(_DRAWS): np.asarray(value)[None] for name, value in arrays.items()
-              if name.startswith(_DRAWS)}
-    return PosteriorDraws(values, {}, None, json.loads(str(arrays[_ATTRIBUTES])))

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lfm_ppl.inference.trace import SharedModel
+from lfm_ppl.inference.unbound_model import SharedModel
 from lfm_ppl.parallel.cluster import Workers, check_workers
 from lfm_ppl.parallel.run import outcomes
 from lfm_ppl.parallel.task import Task
@@ -235,10 +235,10 @@ def fit_many(
     pairs = list(data_sets.items() if isinstance(data_sets, Mapping) else data_sets)
     if not pairs:
         raise ValueError("data_sets is empty; expected at least one pair of a name and (times, y).")
-    each, names = dict(each or {}), dict(pairs)
-    for name in each:
+    own_options, names = dict(each or {}), dict(pairs)
+    for name in own_options:
         checks.one_of("data set in each", name, names)
-        _check_options(f"each[{name!r}]", each[name], [*shared, "truth", "name"])
+        _check_options(f"each[{name!r}]", own_options[name], [*shared, "truth", "name"])
     tasks: dict[str, Task] = {}
     compute = FitDataSet(SharedModel(numpyro_model))
     digests: dict[Any, str] = {}
@@ -247,7 +247,7 @@ def fit_many(
             raise TypeError(f"the names of data sets must be texts, got {name!r}.")
         if name in tasks:
             raise ValueError(f"two data sets are called {name!r}; give every one a name of its own.")
-        tasks[name] = fit_task(compute.model, name, value, {**options, **each.get(name, {})}, seed, digests)
+        tasks[name] = fit_task(compute.model, name, value, {**options, **own_options.get(name, {})}, seed, digests)
     return ManyFits(compute, tasks, None if checkpoint is None else Path(checkpoint), workers=workers,
                     overwrite=overwrite, report=(report or Console()) if progress else None)
 

@@ -16,7 +16,7 @@ import numpy as np
 from lfm_ppl.inference.bind import bind
 from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.problem import signature
-from lfm_ppl.inference.trace import SharedModel
+from lfm_ppl.inference.unbound_model import SharedModel
 from lfm_ppl.io.data_set import Data
 from lfm_ppl.io.input_table import model_keywords
 from lfm_ppl.parallel.task import Task

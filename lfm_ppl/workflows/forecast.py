@@ -258,13 +258,13 @@ def _forecast_selected(view: ResultView, numpyro_model: Callable, times: Times,
     if SELECTED_SERIES in view.attrs:
         panel, label = panel_of(view)
         later = of_all_series(view, _inputs_by_name(view, inputs, numpyro_model))
-        ahead = forecast(panel, numpyro_model, times, inputs=later, **options)
-        predicted = series_view(ResultView.of(ahead), label)
+        panel_forecast = forecast(panel, numpyro_model, times, inputs=later, **options)
+        predicted = series_view(ResultView.of(panel_forecast), label)
     else:
         all_sites, name = all_sites_of(view)
         options = {**options, "events": {name: options["events"]}}
-        ahead = forecast(all_sites, numpyro_model, {name: times}, inputs={name: inputs}, **options)
-        predicted = site_view(ResultView.of(ahead), name)
+        forecast_of_all = forecast(all_sites, numpyro_model, {name: times}, inputs={name: inputs}, **options)
+        predicted = site_view(ResultView.of(forecast_of_all), name)
     new = (GROUP, known_inputs.FORECAST)
     groups = {name: dataset for name, dataset in view.groups.items() if name not in (*new, HELD_OUT)}
     groups |= {name: predicted.groups[name] for name in new if name in predicted.groups}

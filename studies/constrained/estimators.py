@@ -104,7 +104,7 @@ def _estimate_with_link(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...
 
 def _estimate_by_ep(values: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
     """Return EP estimates on every tenth row; a prior truncated on more rows moves the force away from its bound."""
-    rows = TIMES[:: METHODS[BANDS].every]
+    rows = TIMES[:: METHODS[BANDS].spacing]
     posterior = lfm.constrained_posterior(problem.transcription(*values), TIMES, y, lower={FACTOR: 0.0}, grid=rows)
     low, high = shortest_band(posterior, FACTOR)
     return posterior.force_mean[:, 0], jnp.where(posterior.converged, low, jnp.inf), high
@@ -163,13 +163,13 @@ class Method:
     Attributes:
         estimate: map from hyperparameters and a record to estimate and band.
         hyperparameters: kind of hyperparameters, see `_learn`.
-        every: spacing of the estimates in samples.
+        spacing: spacing of the estimates in samples.
         published: published mean squared error.
     """
 
     estimate: Callable[[jax.Array, jax.Array], tuple[jax.Array, ...]]
     hyperparameters: str
-    every: int = 1
+    spacing: int = 1
     published: float = np.nan
 
 
@@ -181,7 +181,7 @@ METHODS = {
     "full information, rate a state": Method(_estimate_by_cost, "record"),
     "full information, rate in Q": Method(_estimate_by_cost, "weight"),
     SMOOTHER: Method(_estimate_by_smoother, "all"), FULL: Method(_estimate_by_full_information, "all"),
-    BANDS: Method(_estimate_by_ep, "all", every=10),
+    BANDS: Method(_estimate_by_ep, "all", spacing=10),
     "softplus link": Method(_estimate_with_link, "softplus")}
 
 
@@ -202,7 +202,7 @@ def transcription(task: Task) -> Result:
     result: Result = {"truth": truth[0], **{f"hyperparameters/{kind}": hyperparameters[kind] for kind in kinds}}
     for label, method in methods.items():
         estimate, low, high = map(np.asarray, _compile(method.estimate)(hyperparameters[method.hyperparameters], y))
-        exact, scored = truth[:, :: method.every], slice(WINDOW // method.every, None)
+        exact, scored = truth[:, :: method.spacing], slice(WINDOW // method.spacing, None)
         is_covered = np.where(np.isfinite(low), (low <= exact) & (exact <= high), np.nan)
         result |= {f"{label}/mse": ((estimate - exact)[:, scored] ** 2).mean(axis=1),
                    f"{label}/minimum": estimate.min(axis=1), f"{label}/coverage": is_covered[:, scored].mean(axis=1),

@@ -25,7 +25,7 @@ def draw(settings: Any, data: Data) -> dict[str, Figure]:
 @style.styled
 def plot_forces(data: Data, *, width: str | float = "column") -> Figure:
     """Draw the first force of each shape, its band, and its estimates by the source and by full information."""
-    shapes, rows = data["transcription"]["shape"].values, problem.TIMES[:: METHODS[BANDS].every]
+    shapes, rows = data["transcription"]["shape"].values, problem.TIMES[:: METHODS[BANDS].spacing]
     figure = style.new_figure(width, 1.25 * len(shapes) + 0.6)
     panels = figure.subplots(len(shapes), 1, sharex=True, squeeze=False)[:, 0]
     for axes, shape in zip(panels, shapes, strict=True):

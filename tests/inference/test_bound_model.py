@@ -24,7 +24,7 @@ from lfm_ppl.inference.bound_samplers import nuts_sampler, ram_sampler
 from lfm_ppl.inference.laplace_start import Laplace
 from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.schedule import Schedule
-from lfm_ppl.inference.trace import SharedModel
+from lfm_ppl.inference.unbound_model import SharedModel
 from lfm_ppl.results.result_view import ResultView
 from tests.compiled_programs import compilations
 

@@ -9,14 +9,15 @@ import pytest
 
 import lfm_ppl as lfm
 from lfm_ppl.model.time_degree import degree_in_time
-from lfm_ppl.model.user_functions import trace
+from lfm_ppl.model.user_functions import trace_function
 
 HELD = lfm.Input([0.0, 1.0, 2.0], [0.0, 1.0, 3.0], "previous", "hold")
 LINEAR = lfm.Input([0.0, 1.0, 2.0], [0.0, 1.0, 3.0], "linear", "hold")
 
 
 def degree(function):
-    return degree_in_time(trace("dynamics", "f(x, u, t)", function, jnp.ones(2), jnp.ones(1), jnp.asarray(0.5)))
+    arguments = jnp.ones(2), jnp.ones(1), jnp.asarray(0.5)
+    return degree_in_time(trace_function("dynamics", "f(x, u, t)", function, *arguments))
 
 
 @pytest.mark.parametrize(("function", "expected"), [

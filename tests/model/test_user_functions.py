@@ -12,7 +12,7 @@ import pytest
 from systems import whole_state
 
 import lfm_ppl as lfm
-from lfm_ppl.model.user_functions import trace
+from lfm_ppl.model.user_functions import trace_function
 
 TABLE = jnp.array([1.0, 2.0, 4.0, 8.0])
 OBSERVATION = lfm.GaussianObservation(whole_state, jnp.ones(2))
@@ -25,7 +25,7 @@ def make(dynamics=lambda x, u, t: -x, observation=OBSERVATION, **options):
 
 def check(function):
     """Check a function of x (3,)."""
-    trace("dynamics", "f(x)", function, jnp.zeros(3)).check_indices(("x",))
+    trace_function("dynamics", "f(x)", function, jnp.zeros(3)).check_indices(("x",))
 
 
 @pytest.mark.parametrize("function, message", [

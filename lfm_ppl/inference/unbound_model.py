@@ -1,4 +1,4 @@
-"""A NumPyro model that was run with numbers: its sites, and its densities as functions of a `Problem`.
+"""A NumPyro model without its data: its sites, and its densities as functions of a `Problem`.
 
 1. Run the model with numbers, at the prior's medians: its latent sites, their coordinates, its likelihood sites.
 2. Run it with abstract parameters and data. A model that needs the values of its data (a Python branch, a NumPy
@@ -7,9 +7,11 @@
    constant times of step 1 then replace them. Times that depend on parameters or data stay traced.
 4. Run the model with abstract times and arrays, too. Where that works, they become leaves of the `Problem`, with the
    time grids that were laid out for their values. Where it fails, programs are compiled for the values.
-5. Every call of `trace_model` runs the model anew. Two models share machine code where their programs have the same
-   text (`lfm_ppl.utils.programs`), and the programs themselves only as a `SharedModel`, whose caller knows that the
-   model function stays the same.
+5. Every call of `model_and_problems` runs the model anew. Two models share machine code where their programs have the
+   same text (`lfm_ppl.utils.programs`), and the programs themselves only as a `SharedModel`, whose caller knows that
+   the model function stays the same.
+
+A trace is NumPyro's: name of a site -> its distribution and value. What JAX traces, tracers, is abstract or traced.
 """
 
 from __future__ import annotations
@@ -33,14 +35,8 @@ from numpyro.infer.util import log_density as constrained_log_density
 from lfm_ppl.filtering.time_grid import refuse_traced_times
 from lfm_ppl.inference.problem import Problem, is_numeric, shapes
 from lfm_ppl.inference.unconstrained import check_latent, coordinate_names, latent_sites
-from lfm_ppl.likelihoods.likelihood_site import (
-    LikelihoodSite,
-    SiteTimes,
-    likelihood_sites,
-    record_likelihoods,
-    replace_anchors,
-    replace_times,
-)
+from lfm_ppl.likelihoods.handlers.binding import SiteTimes, record_likelihoods, replace_anchors, replace_times
+from lfm_ppl.likelihoods.likelihood_site import LikelihoodSite, likelihood_sites
 from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 from lfm_ppl.utils import checks
 
@@ -90,8 +86,8 @@ class SharedModel:
         return SharedModel, (self.fn,)
 
 
-class TracedModel:
-    """A NumPyro model that was run with numbers.
+class UnboundModel:
+    """A NumPyro model that was run with numbers: its densities are functions of z and a problem.
 
     Args:
         model: a NumPyro model.
@@ -280,9 +276,9 @@ def _traced_structure(likelihood: MarginalLikelihood) -> Hashable:
     return _structure(likelihood)
 
 
-def trace_model(model: Callable, arguments: tuple, keywords: Mapping[str, Any], caller: str,
-                programs: Programs | None = None) -> tuple[TracedModel, Problem, Problem]:
-    """Return the traced model, its problem with constant times and inputs, and the problem that its programs take.
+def model_and_problems(model: Callable, arguments: tuple, keywords: Mapping[str, Any], caller: str,
+                       programs: Programs | None = None) -> tuple[UnboundModel, Problem, Problem]:
+    """Return the unbound model, its problem with constant times and inputs, and the problem that its programs take.
 
     The last argument is the data where it is a pytree of real arrays.
 
@@ -300,30 +296,30 @@ def trace_model(model: Callable, arguments: tuple, keywords: Mapping[str, Any], 
     with jax.ensure_compile_time_eval():  # the call may come from compiled code
         try:
             problem = Problem.of_constants(arguments, keywords, data)
-            traced = TracedModel(model, problem, caller)
-            times, structures = traced.constant_times(problem)
+            unbound = UnboundModel(model, problem, caller)
+            times, structures = unbound.constant_times(problem)
         except _TRACING_ERRORS:
             # The model needs the values of its data; any other error is raised again, by its first density at last.
             problem = Problem.of_constants(arguments, keywords)
-            traced = TracedModel(model, problem, caller)
+            unbound = UnboundModel(model, problem, caller)
             times, structures = {}, []
             with contextlib.suppress(*_TRACING_ERRORS):
-                times, structures = traced.constant_times(problem)
+                times, structures = unbound.constant_times(problem)
         tabulated = None if checks.traced((arguments, dict(keywords))) else _with_traced_inputs(
-            traced, problem, times, structures, programs or Programs())
+            unbound, problem, times, structures, programs or Programs())
     constant = {name: site_times._replace(layout=None) for name, site_times in times.items()}
     problem = problem.with_grids(constant)
-    return traced, problem, tabulated or problem
+    return unbound, problem, tabulated or problem
 
 
-def _with_traced_inputs(traced: TracedModel, problem: Problem, times: Mapping[str, SiteTimes],
+def _with_traced_inputs(unbound: UnboundModel, problem: Problem, times: Mapping[str, SiteTimes],
                         structures: list[Hashable], programs: Programs) -> Problem | None:
     """Return the problem with times, arrays among the arguments and time grids as leaves; None: it cannot be traced so.
 
     Not where a likelihood is a panel or has constraints, where its times depend on parameters, or where the structure
     of the model depends on the values of its arguments.
     """
-    layouts = [times.get(site.name, SiteTimes(None)).layout for site in traced.likelihoods]
+    layouts = [times.get(site.name, SiteTimes(None)).layout for site in unbound.likelihoods]
     if problem.data is None or not layouts or any(layout is None for layout in layouts):
         return None
     tabulated = problem.with_traced_inputs({
@@ -332,7 +328,7 @@ def _with_traced_inputs(traced: TracedModel, problem: Problem, times: Mapping[st
     key = tabulated.kind, *structures
     if key not in programs.is_traceable:
         try:
-            programs.is_traceable[key] = traced.structures(tabulated) == structures
+            programs.is_traceable[key] = unbound.structures(tabulated) == structures
         except Exception:  # of any kind: a model may do with its arguments what tracers cannot
             programs.is_traceable[key] = False
     return tabulated if programs.is_traceable[key] else None
