@@ -147,7 +147,7 @@ def full_information(model: LatentForceModel, times: ArrayLike, y: ArrayLike,
         >>> import jax.numpy as jnp, numpy as np, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.3), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> estimate = lfm.full_information(model, np.arange(3.0), -jnp.ones((3, 1)), lower={"u": 0.0})
         >>> bool(estimate.force("u").mean.min() >= 0), bool(estimate.converged)
         (True, True)
