@@ -12,7 +12,7 @@ import griffe
 
 _EXAMPLE = re.compile(r"^(\s*)Example:[ \t]*$", re.MULTILINE)
 _NAME = re.compile(r"(?<!`)`(?:lfm_ppl|lfm)\.([\w.]+)`(?!`)")
-_CONSTANT = re.compile(r"_?[A-Z][A-Z_]+")
+_CONSTANT = re.compile(r"(?:[a-z_]+\.)?_?[A-Z][A-Z_]+")
 _DIRECTIVE = re.compile(r"^::: lfm_ppl\.(\S+)$", re.MULTILINE)
 _REFERENCE = Path(__file__).resolve().parent.parent / "api"
 
