@@ -36,7 +36,8 @@ class Docstrings(griffe.Extension):
                 if _CONSTANT.fullmatch(str(parameter.default)):
                     # What a module imports from outside of the package keeps its name.
                     with contextlib.suppress(griffe.NameResolutionError, KeyError):
-                        path = function.parent.resolve(str(parameter.default))
+                        module_or_constant, *rest = str(parameter.default).split(".")
+                        path = ".".join([function.parent.resolve(module_or_constant), *rest])
                         parameter.default = pkg[path.removeprefix(f"{pkg.name}.")].value
 
     def _link(self, found: re.Match[str]) -> str:
