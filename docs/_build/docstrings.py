@@ -36,13 +36,13 @@ class Docstrings(griffe.Extension):
                 if _CONSTANT.fullmatch(str(parameter.default)):
                     # What a module imports from outside of the package keeps its name.
                     with contextlib.suppress(griffe.NameResolutionError, KeyError):
-                        module_or_constant, *rest = str(parameter.default).split(".")
-                        path = ".".join([function.parent.resolve(module_or_constant), *rest])
+                        first_name, *attributes = str(parameter.default).split(".")
+                        path = ".".join([function.parent.resolve(first_name), *attributes])
                         parameter.default = pkg[path.removeprefix(f"{pkg.name}.")].value
 
-    def _link(self, found: re.Match[str]) -> str:
-        name = found[1]
-        return f"[`lfm.{name}`][lfm_ppl.{name}]" if name in self._known else found[0]
+    def _link(self, match: re.Match[str]) -> str:
+        name = match[1]
+        return f"[`lfm.{name}`][lfm_ppl.{name}]" if name in self._known else match[0]
 
 
 def _functions(parent: griffe.Module | griffe.Class) -> Iterator[griffe.Function]:
