@@ -99,7 +99,7 @@ def build(
         forces={"u": lfm.Matern(scale=scale, lengthscale=lengthscale, order=2)},
         process_noise=jnp.diag(jnp.array([q_r, q_v], dtype=float)),
         observation=(lfm.StudentTObservation(distance, df, noise_sd) if df
-                     else lfm.GaussianObservation(distance, noise_sd**2 * jnp.ones(1))),
+                     else lfm.GaussianObservation(distance, sd=noise_sd)),
         initial_state=lfm.Gaussian(jnp.array(START), jnp.diag(jnp.array(start_sd) ** 2)),
         state_names=("altitude", "speed"),
         output_names=OUTPUTS,

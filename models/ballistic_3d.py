@@ -105,7 +105,7 @@ def build(
         forces={f"u_{axis}": lfm.Matern(scale=scale, lengthscale=lengthscale, order=2) for axis in AXES},
         process_noise=jnp.diag(jnp.concatenate([q_r * jnp.ones(3), q_v * jnp.ones(3)])),
         observation=lfm.GaussianObservation(
-            radar, jnp.stack([jnp.asarray(sd, float) ** 2 for sd in (range_sd, angle_sd, angle_sd)]), angular=(1,)
+            radar, sd=jnp.stack([jnp.asarray(sd, float) for sd in (range_sd, angle_sd, angle_sd)]), angular=(1,)
         ),
         initial_state=lfm.Gaussian(jnp.array(START), jnp.diag(jnp.array(start_sd) ** 2)),
         state_names=(*AXES, *(f"speed_{axis}" for axis in AXES)),

@@ -157,13 +157,13 @@ def build(mean, scale, noise_sd, lengthscale=None, memory=None, force="sqm", lin
         settling = omega(t) * idle_fraction**2
         return (rate - omega(t) * jnp.sign(x) * (1.0 - idle_fraction)) * idle_fraction / (1.0 + fastest * settling)
 
-    def variance(x, u, t):
-        return (noise_sd * jnp.exp(-x)) ** 2
+    def error_sd(x, u, t):
+        return noise_sd * jnp.exp(-x)
 
     return lfm.LatentForceModel(
         dynamics=dynamics,
         forces={"arrivals": arrivals(force, mean, scale, lengthscale, memory, period, functions, cycles)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x, variance),
+        observation=lfm.GaussianObservation(lambda x, u, t: x, sd=error_sd),
         initial_state=lfm.Gaussian(0.5 * jnp.ones(1), 0.25 * jnp.ones(1)),
         state_names=(LOG_QUEUE,),
         output_names=(LOG_QUEUE,),

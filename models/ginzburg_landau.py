@@ -69,7 +69,7 @@ def build(alpha, beta, sigma, noise_sd, units=None, start=None) -> lfm.LatentFor
         dynamics=lambda x, u, t: -(alpha * x + beta * x**3),
         forces={},
         process_noise=sigma * jnp.ones((1, 1)),
-        observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
+        observation=lfm.GaussianObservation(lambda x, u, t: x, sd=noise_sd),
         initial_state=lfm.Gaussian([0.0 if is_unknown else start], [10.0 if is_unknown else 0.0]),
         state_names=("x",),
         output_names=OUTPUTS,

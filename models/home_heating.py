@@ -144,7 +144,7 @@ def build(heater, residual, alpha, beta, noise_sd, outdoor, gamma=None, psi=None
                 **({} if residual is None else {"residual": residual})},
         observation=lfm.GaussianObservation(
             lambda x, u, t: jnp.stack([x[0], u[0]]),
-            jnp.stack([jnp.asarray(noise_sd, float) ** 2, jnp.asarray(OUTDOOR_NOISE**2)])),
+            sd=jnp.stack([jnp.asarray(noise_sd, float), jnp.asarray(OUTDOOR_NOISE)])),
         initial_state=lfm.Gaussian(jnp.array(START[::2][:size]), jnp.diag(jnp.array(START[1::2][:size]) ** 2)),
         state_names=("air", "walls")[:size],
         output_names=OUTPUTS,

@@ -72,7 +72,7 @@ def build(absorption, lag, clearance, volume, scale, lengthscale, noise_sd, exch
     return lfm.LatentForceModel(
         dynamics=dynamics,
         forces={"u": lfm.Matern(scale=scale, lengthscale=lengthscale, order=1)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x[1:2] / volume, noise_sd**2 * jnp.ones(1)),
+        observation=lfm.GaussianObservation(lambda x, u, t: x[1:2] / volume, sd=noise_sd),
         initial_state=lfm.Gaussian(jnp.zeros(len(names)), jnp.zeros((len(names), len(names)))),
         state_names=names,
         output_names=OUTPUTS,

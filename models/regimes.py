@@ -56,7 +56,7 @@ def build(level, rate, scale, lengthscale, noise_sd, units=None) -> lfm.LatentFo
     return lfm.LatentForceModel(
         dynamics=lambda x, u, t: rate * (level + u - x),
         forces={"drift": lfm.Matern(scale=scale, lengthscale=lengthscale, order=0)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
+        observation=lfm.GaussianObservation(lambda x, u, t: x, sd=noise_sd),
         initial_state=lfm.Gaussian(jnp.reshape(level, (1,)), START_SD**2 * jnp.eye(1)),
         state_names=("isotopes",),
         output_names=OUTPUTS,

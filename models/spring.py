@@ -56,7 +56,7 @@ def build(damping, stiffness, sensitivity, lengthscale, noise_sd, units=None) ->
     return lfm.LatentForceModel(
         dynamics=dynamics,
         forces={"u": lfm.Matern(scale=1.0, lengthscale=lengthscale, order=2)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x[0::2], noise_sd**2 * jnp.ones(2)),
+        observation=lfm.GaussianObservation(lambda x, u, t: x[0::2], sd=noise_sd),
         initial_state=lfm.Gaussian(jnp.zeros(4), jnp.eye(4)),
         state_names=("position 1", "velocity 1", "position 2", "velocity 2"),
         output_names=OUTPUTS,

@@ -128,7 +128,7 @@ def build(level, scale, lengthscale, variation, trh=None, start_sd=START_SD, uni
     return lfm.LatentForceModel(
         dynamics=lambda x, u, t: axis(x, trh(t) if trh else u[0]),
         forces=force,
-        observation=lfm.GaussianObservation(assays, (variation * FREE) ** 2),
+        observation=lfm.GaussianObservation(assays, sd=variation * FREE),
         initial_state=lfm.Gaussian(jnp.asarray(STEADY), jnp.diag(jnp.asarray(start_sd) ** 2)),
         state_names=("T4", "T3", "T3 of the pituitary", "TSH"),
         output_names=OUTPUTS,

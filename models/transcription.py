@@ -131,7 +131,7 @@ def build(
         dynamics=lambda x, u, t: basal + sensitivity * activity(u[0], link, gamma) - decay * x,
         forces={FACTOR: lfm.Matern(scale=scale, lengthscale=lengthscale, order=1)},
         observation=(lfm.StudentTObservation(lambda x, u, t: x, df, noise_sd) if df
-                     else lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2)),
+                     else lfm.GaussianObservation(lambda x, u, t: x, sd=noise_sd)),
         initial_state=resting_state if start is None else lfm.Gaussian(start, jnp.zeros((size, size))),
         state_names=outputs,
         output_names=outputs,

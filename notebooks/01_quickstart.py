@@ -51,7 +51,7 @@ def build(decay, lengthscale, noise_sd):
     return lfm.LatentForceModel(
         dynamics=lambda x, u, t: jax.nn.softplus(u) - decay * x,
         forces={"factor": lfm.Matern(scale=1.5, lengthscale=lengthscale, order=1)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
+        observation=lfm.GaussianObservation(lambda x, u, t: x, sd=noise_sd),
         initial_state=lfm.Gaussian(jnp.ones(1), jnp.eye(1)),
         state_names=["expression"],
         output_names=["expression"],

@@ -37,7 +37,7 @@ import pandas as pd
 from numpyro.infer import NUTS
 
 import lfm_ppl as lfm
-from lfm_ppl.accuracy import calibration
+from lfm_ppl.accuracy.calibration import p_values
 
 quick = bool(os.environ.get("LFM_QUICK"))
 data_sets = 8 if quick else 240
@@ -63,7 +63,7 @@ def motif(times, y=None, link=lambda u: u, steps=10):
     model = lfm.LatentForceModel(
         dynamics=lambda x, u, t: sensitivity * link(u) - decay * x,
         forces={"u": lfm.Matern(scale=1.0, lengthscale=lengthscale, order=1)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
+        observation=lfm.GaussianObservation(lambda x, u, t: x, sd=noise_sd),
         initial_state=lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))),
     )
     numpyro.sample("y", lfm.MarginalLikelihood(model, times, steps=steps, iterations=0), obs=y)
@@ -90,7 +90,7 @@ for label, model in (("linear", motif), ("softplus", softplus)):
     for sampler, settings in samplers.items():
         started = time.perf_counter()
         key = jax.random.key(12)
-        computed[label, sampler] = calibration.calibrate(key, model, times, data_sets=data_sets, **settings)
+        computed[label, sampler] = lfm.calibrate(key, model, times, data_sets=data_sets, **settings)
         seconds[label, sampler] = time.perf_counter() - started
 
 # %% [markdown]
@@ -128,7 +128,7 @@ lfm.plot_calibration(computed["softplus", "RAM"], width="full")
 rows = []
 for (label, sampler), result in computed.items():
     for scalar, rank in result.ranks.items():
-        p = calibration.p_values(rank, result.draws)
+        p = p_values(rank, result.draws)
         rows.append({"model": label, "sampler": sampler, "scalar": scalar, **p})
 table = pd.DataFrame(rows).set_index(["model", "sampler", "scalar"])
 print(table.round(3).to_string())

@@ -124,7 +124,7 @@ def model(period=10.0):
     return lfm.LatentForceModel(
         dynamics=lambda x, u, t: u - 0.5 * x,
         forces={"u": lfm.QuasiPeriodic(kernel, steps, functions=7)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
+        observation=lfm.GaussianObservation(lambda x, u, t: x, sd=0.1),
         initial_state=lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
         initial_time=0.0,
     )

@@ -71,7 +71,7 @@ def build(heater):
     return lfm.LatentForceModel(
         lambda x, u, t: 0.1 * (5.0 - x) + 2.5 * heater + u,
         {"residual": lfm.Matern(scale=0.3, lengthscale=3.0)},
-        lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.0025])),
+        lfm.GaussianObservation(lambda x, u, t: x, sd=0.05),
         lfm.Gaussian(jnp.array([16.0]), 0.01 * jnp.eye(1)),
     )
 

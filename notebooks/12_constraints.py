@@ -59,7 +59,7 @@ smoothed = lfm.smooth(model, times, y).force("factor").mean
 computed = lfm.full_information(model, times, y, lower={"factor": 0.0}, grid=times)
 pd.DataFrame({"least": [smoothed.min(), computed.force("factor").mean.min()],
               "MSE": [np.mean((a - truth) ** 2) for a in (smoothed, computed.force("factor").mean)]},
-             ["smoother", "full information"])
+             ["smoother", "full information"]).astype(float).round(4)
 
 # %% [markdown]
 # Full information gives the most probable trajectory. Of bands that respect the bound, and of draws that do, it says
@@ -75,7 +75,7 @@ axes.plot(posterior.times, draws.T, color="#0072B2", lw=0.5, label=["draws", *[N
 axes.plot(times, truth, color="black", lw=0.8, ls="--", label="truth")
 axes.set(xlabel="time (s)", ylabel="force", xlim=(0, 15), ylim=(0, 2))
 axes.legend(frameon=False, ncols=3)
-print("least value of the draws:", draws.min())
+print(f"least value of the draws: {draws.min():.1e}")
 
 # %% [markdown]
 # ## Hyperparameters

@@ -18,9 +18,9 @@
 # measured eleven times within a day, at times that differ between subjects. The model is that of
 # `lfm-ppl fit pharmacokinetics` with one compartment: gut and blood are amounts in mg per kg of body weight,
 #
-# $$\text{gut}' = -k_a\,\text{gut}, \qquad \text{gut} \leftarrow \text{gut} + \text{dose at } t = 0,$$
+# $$\frac{d\,\text{gut}}{dt} = -k_a\,\text{gut}, \qquad \text{gut} \leftarrow \text{gut} + \text{dose at } t = 0,$$
 #
-# $$\text{blood}' = k_a\,\text{gut} - \frac{CL}{V}\,\text{blood} + u(t), \qquad
+# $$\frac{d\,\text{blood}}{dt} = k_a\,\text{gut} - \frac{CL}{V}\,\text{blood} + u(t), \qquad
 #   y_k = \text{blood}(t_k) / V + e_k.$$
 #
 # A dose is an event, `lfm.Dose`: the state jumps at its time. The latent force $u$ is what first-order absorption does
@@ -90,7 +90,7 @@ def build(p):
 
     return lfm.LatentForceModel(
         dynamics, {"u": lfm.Matern(p["scale"], 3.0, order=1)},
-        lfm.GaussianObservation(lambda x, u, t: x[1:] / p["volume"], p["noise_sd"]**2 * jnp.ones(1)),
+        lfm.GaussianObservation(lambda x, u, t: x[1:] / p["volume"], sd=p["noise_sd"]),
         lfm.Gaussian(jnp.zeros(2), jnp.zeros((2, 2))), state_names=("gut", "blood"),
         output_names=("concentration",), initial_time=0.0,
         units={"time": "h", "concentration": "mg/L", "gut": "mg/kg", "blood": "mg/kg", "u": "mg/kg/h"},
@@ -126,6 +126,13 @@ lfm.summary(result).filter(regex="_mean|_sd|scale", axis=0)
 
 # %%
 lfm.plot_fit(result, width="full")
+
+# %% [markdown]
+# The force of each subject: the rate at which the drug enters or leaves the blood beside absorption and clearance. All
+# bands hold zero at all times.
+
+# %%
+lfm.plot_forces(result, width="full")
 
 # %% [markdown]
 # ## Partial pooling

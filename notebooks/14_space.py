@@ -16,7 +16,7 @@
 # A latent force may depend on the place. This notebook estimates
 #
 # - a heat source that nobody measured, from thermometers along a rod. Temperature $x$ and source $s$ are fields,
-#   $$x_t = D\,x_{rr} - \gamma\,x + s(r, t),$$
+#   $x_t = D\,x_{rr} - \gamma\,x + s(r, t)$,
 #   and both are expanded in eigenfunctions of the Laplacian (`lfm.heat`);
 # - the rate of events in a square that changes in time, a log-Gaussian Cox process whose covariance is the product of
 #   one in space and one in time (`lfm.SeparableField`).

@@ -73,7 +73,7 @@ def _cell_parts(cell: dict[str, Any], name: str, heading: str, pictures: list[by
         yield source
         return
     yield _fenced(source, "python")
-    for output in cell["outputs"]:
+    for output in _merged_streams(cell["outputs"]):
         data = output.get("data", {})
         if "image/png" in data:
             pictures.append(base64.b64decode(_joined(data["image/png"])))
@@ -83,6 +83,17 @@ def _cell_parts(cell: dict[str, Any], name: str, heading: str, pictures: list[by
         elif text := _joined(output.get("text", data.get("text/plain", ""))).strip("\n"):
             text = _ESCAPES.sub("", text)
             yield _fenced(_KERNEL_FILE.sub("", text) if output.get("name") == "stderr" else text, "text")
+
+
+def _merged_streams(outputs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the outputs of a cell with what was printed in pieces, one after the other, as one output."""
+    merged: list[dict[str, Any]] = []
+    for output in outputs:
+        if merged and output["output_type"] == "stream" and output["name"] == merged[-1].get("name"):
+            merged[-1] = output | {"text": _joined(merged[-1]["text"]) + _joined(output["text"])}
+        else:
+            merged.append(output)
+    return merged
 
 
 def _plain(heading: str) -> str:

@@ -23,7 +23,7 @@ def model(times, y=None, inputs=None):
     forces = {"rhythm": lfm.Periodic(kernel, functions=13, explained_variance=0.0)}
     forces |= {f"{what} of {day}": lfm.Constant(0.15) for what in ("level", "slope") for day in DAYS}
     observation = lfm.GaussianObservation(lambda x, u, t: 7.5 + x + u[0] + sum(
-        inputs[day](t) * (u[1 + k] + u[5 + k] * inputs["hour"](t)) for k, day in enumerate(DAYS)), [noise_sd**2])
+        inputs[day](t) * (u[1 + k] + u[5 + k] * inputs["hour"](t)) for k, day in enumerate(DAYS)), sd=noise_sd)
     centre = lfm.LatentForceModel(lambda x, u, t: -x / memory, forces, observation, lfm.Gaussian([0.0], [1.0]),
                                   process_noise=size * jnp.sqrt(2.0 / memory) * jnp.ones((1, 1)))
     numpyro.sample("y", lfm.MarginalLikelihood(centre, times), obs=y)

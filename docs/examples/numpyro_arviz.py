@@ -21,8 +21,7 @@ def gene(times, y=None, order=1):
     model = lfm.LatentForceModel(
         dynamics=lambda x, u, t: u - decay * x,
         forces={"production": lfm.Matern(1.0, lengthscale, order=order)},
-        observation=lfm.GaussianObservation(lambda x, u, t: x,
-                                            jnp.array([0.01])),
+        observation=lfm.GaussianObservation(lambda x, u, t: x, sd=0.1),
         initial_state=lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
         initial_time=-1.0,
     )

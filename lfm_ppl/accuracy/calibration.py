@@ -94,7 +94,7 @@ def calibrate(key: jax.Array, numpyro_model: Callable, times: Any, kernel: Calla
         >>> import jax.numpy as jnp, numpyro, numpyro.distributions as dist, lfm_ppl as lfm
         >>> def level(times, y=None):
         ...     system = lfm.LatentForceModel(
-        ...         lambda x, u, t: jnp.zeros(1), {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.ones(1)),
+        ...         lambda x, u, t: jnp.zeros(1), {}, lfm.GaussianObservation(lambda x, u, t: x, sd=1.0),
         ...         lfm.Gaussian(numpyro.sample("level", dist.Normal())[None], jnp.zeros((1, 1))))
         ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
         >>> found = calibrate(jax.random.key(0), level, [0.0, 1.0], lfm.RAM, data_sets=5, draws=7, warmup=20)

@@ -97,7 +97,7 @@ def check_accuracy(result: Any, numpyro_model: Callable, times: Any = None, y: A
         ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
         ...     system = lfm.LatentForceModel(
         ...         lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
         >>> result = lfm.fit(model, np.arange(5.0), np.ones((5, 1)), sampler="map", samples=50, progress=False)

@@ -209,7 +209,7 @@ def stacked_model(model: LatentForceModel, constraints: Constraints | Boxes) -> 
     """Return the state-space model with outputs (h, c) without noise, for factors."""
     noise = jnp.zeros(len(model.output_names) + constraints.count)
     function = StackedOutputs(model.observation.function, constraints)
-    return _replace_observation(model, GaussianObservation(function, noise), constraints)
+    return _replace_observation(model, GaussianObservation(function, covariance=noise), constraints)
 
 
 def _replace_observation(model: LatentForceModel, observation: GaussianObservation,

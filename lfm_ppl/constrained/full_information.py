@@ -85,15 +85,18 @@ class ConstrainedEstimate(eqx.Module):
         Raises:
             ValueError: an unknown name; the message lists similar names.
         """
-        checks.one_of("state", name, self.state_names)
-        mean = self.state_mean[:, self.state_names.index(name)]
-        return MeanSd(mean, jnp.full_like(mean, jnp.nan))
+        return named_mean("state", name, self.state_names, self.state_mean)
 
     def force(self, name: str) -> MeanSd:
         """Return the trajectory (K,) of a force as ``mean``; its ``sd`` is NaN."""
-        checks.one_of("force", name, self.force_names)
-        mean = self.force_mean[:, self.force_names.index(name)]
-        return MeanSd(mean, jnp.full_like(mean, jnp.nan))
+        return named_mean("force", name, self.force_names, self.force_mean)
+
+
+def named_mean(kind: str, name: str, names: tuple[str, ...], means: jax.Array) -> MeanSd:
+    """Return the mean of a state or force by its name, from means (..., N) of all, with an sd of NaN."""
+    checks.one_of(kind, name, names)
+    mean = means[..., names.index(name)]
+    return MeanSd(mean, jnp.full_like(mean, jnp.nan))
 
 
 def full_information(model: LatentForceModel, times: ArrayLike, y: ArrayLike,
@@ -147,7 +150,7 @@ def full_information(model: LatentForceModel, times: ArrayLike, y: ArrayLike,
         >>> import jax.numpy as jnp, numpy as np, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.3), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> estimate = lfm.full_information(model, np.arange(3.0), -jnp.ones((3, 1)), lower={"u": 0.0})
         >>> bool(estimate.force("u").mean.min() >= 0), bool(estimate.converged)
         (True, True)

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 
 from lfm_ppl.constrained.augmented import Rows, augmented_model
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
-from lfm_ppl.constrained.full_information import ConstrainedEstimate, check_settings, solve_problem
+from lfm_ppl.constrained.full_information import ConstrainedEstimate, check_settings, named_mean, solve_problem
 from lfm_ppl.constrained.gauss_newton import ConstrainedDynamics
 from lfm_ppl.constrained.interior_point import ConstrainedProblem
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
@@ -37,6 +37,7 @@ from lfm_ppl.filtering.forward import forward
 from lfm_ppl.filtering.intervals import TimeGrid, intervals_between
 from lfm_ppl.filtering.moments import Moments, Record
 from lfm_ppl.filtering.problem import filter_problem
+from lfm_ppl.filtering.smoother import MeanSd
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.linearisation.taylor import Taylor
 from lfm_ppl.model.inputs import breakpoints_within
@@ -77,6 +78,7 @@ class HorizonEstimate:
         force_mean: (R,), forces.
         converged: whether the window's problem was solved.
         passes: number of smoother passes.
+        state_names, force_names: names of the M states and the R forces.
     """
 
     time: jax.Array
@@ -84,6 +86,20 @@ class HorizonEstimate:
     force_mean: jax.Array
     converged: jax.Array
     passes: jax.Array
+    state_names: tuple[str, ...] = eqx.field(static=True)
+    force_names: tuple[str, ...] = eqx.field(static=True)
+
+    def state(self, name: str) -> MeanSd:
+        """Return a physical state at the time of the estimate as ``mean`` (); its ``sd`` is NaN.
+
+        Raises:
+            ValueError: an unknown name; the message lists similar names.
+        """
+        return named_mean("state", name, self.state_names, self.state_mean)
+
+    def force(self, name: str) -> MeanSd:
+        """Return a force at the time of the estimate as ``mean`` (); its ``sd`` is NaN."""
+        return named_mean("force", name, self.force_names, self.force_mean)
 
 
 class HorizonSettings(eqx.Module):
@@ -148,7 +164,7 @@ class MovingHorizon(eqx.Module):
         >>> import jax.numpy as jnp, numpy as np, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.3), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
         ...     initial_time=0.0)
         >>> horizon = lfm.MovingHorizon(model, window=3, delay=0, lower={"u": 0.0})
         >>> bool(horizon.estimate(np.arange(6.0), -jnp.ones((6, 1))).force("u").mean.min() >= 0)
@@ -158,7 +174,7 @@ class MovingHorizon(eqx.Module):
 
         >>> state, estimate = horizon.update(horizon.start(), 0.5, [-1.0])
         >>> state, estimate = horizon.update(state, 1.0, [-1.0])
-        >>> float(estimate.time), bool(estimate.force_mean[0] >= 0)
+        >>> float(estimate.time), bool(estimate.force("u").mean >= 0)
         (1.0, True)
 
     Source: Wolff, Lopez, Müller and Beckers, section 3.3 and equations 13 to 17; Rawlings, Mayne and Diehl (2017),
@@ -349,7 +365,7 @@ def _update(settings: HorizonSettings, state: HorizonState, t: jax.Array,
     row = settings.estimated_row
     time = jnp.where(is_observed[row], state.times[row], jnp.nan)
     return state, HorizonEstimate(time, estimate.state_mean[row], estimate.force_mean[row], estimate.converged,
-                                  estimate.passes)
+                                  estimate.passes, estimate.state_names, estimate.force_names)
 
 
 _ROW_FIELDS = ("times", "state_mean", "force_mean", "slack", "multiplier", "violation", "scale")

@@ -188,7 +188,7 @@ def constrained_posterior(model: LatentForceModel, times: ArrayLike, y: ArrayLik
         >>> import jax.numpy as jnp, numpy as np, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.3), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> times = np.arange(3.0)
         >>> posterior = lfm.constrained_posterior(model, times, jnp.ones((3, 1)), lower={"u": 0.0}, grid=times)
         >>> bool(posterior.interval("u")[0].min() >= 0)

@@ -211,7 +211,7 @@ def smooth(model: LatentForceModel, times: ArrayLike, y: ArrayLike, rule: Rule |
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.3), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> lfm.smooth(model, jnp.arange(3.0), jnp.ones((3, 1)), at=jnp.linspace(0, 4, 5)).force("u").mean.shape
         (5,)
 

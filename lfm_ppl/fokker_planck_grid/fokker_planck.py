@@ -118,7 +118,7 @@ def fokker_planck(model: LatentForceModel, times: ArrayLike, y: ArrayLike, *, at
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
-        ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1))
         >>> result = fokker_planck(model, [0.0, 1.0], jnp.ones((2, 1)), cells=200)
         >>> result.filtered.shape, bool(result.error < 1e-3)
@@ -171,7 +171,7 @@ def choose_grid(models: LatentForceModel | Sequence[LatentForceModel], times: Ar
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
-        ...     lambda x, u, t: -x, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...     lambda x, u, t: -x, {}, lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1))
         >>> choose_grid(model, [0.0, 1.0], jnp.ones((2, 1)), bounds=(-8.0, 8.0), cells=100).width
         0.16

@@ -202,7 +202,7 @@ def log_likelihood(ssm: StateSpaceModel, time_grid: TimeGrid, y: jax.Array, grid
         >>> from lfm_ppl.filtering.time_grid import build_time_grid
         >>> from lfm_ppl.model.state_space import state_space
         >>> ssm = state_space(lfm.LatentForceModel(
-        ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1)))
         >>> time_grid = build_time_grid(ssm, [0.0, 1.0, 2.0], 1)
         >>> log_likelihood(ssm, time_grid, jnp.ones((5, 3, 1)), Grid(-6.0, 6.0, 100)).shape

@@ -29,44 +29,47 @@ __all__ = ["PenalisedLengthscale", "penalised_complexity"]
 
 
 class PenalisedLengthscale(dist.Distribution):
-    r"""The penalised-complexity prior of a lengthscale, with ``P(lengthscale < shortest) = probability``.
+    r"""The penalised-complexity prior of a lengthscale, with ``P(lengthscale < shortest_lengthscale) = probability``.
 
         p(l) = r / 2 l^(-3/2) exp(-r l^(-1/2)),    P(lengthscale < l) = exp(-r l^(-1/2)),
-        r = -log(probability) shortest^(1/2).
+        r = -log(probability) shortest_lengthscale^(1/2).
 
     Its upper tail is long on purpose, so that it has no mean: a slow force is a simple one.
 
     Args:
-        shortest: a lengthscale that would surprise from below, in units of time; > 0.
+        shortest_lengthscale: a lengthscale that would surprise from below, in units of time; > 0.
         probability: of a lengthscale below it, between 0 and 1.
 
     Raises:
-        ValueError: ``shortest`` is not positive, or the probability is not between 0 and 1.
+        ValueError: ``shortest_lengthscale`` is not positive, or the probability is not between 0 and 1.
 
     Example:
         >>> import lfm_ppl as lfm
-        >>> prior = lfm.priors.PenalisedLengthscale(shortest=1.0)
+        >>> prior = lfm.priors.PenalisedLengthscale(shortest_lengthscale=1.0)
         >>> round(float(prior.cdf(1.0)), 4), round(float(prior.icdf(0.5)), 2)
         (0.05, 18.68)
 
     Source: Fuglstad, Simpson, Lindgren and Rue (2019).
     """
 
-    arg_constraints = {"shortest": constraints.positive, "probability": constraints.unit_interval}  # noqa: RUF012
+    arg_constraints = {  # noqa: RUF012
+        "shortest_lengthscale": constraints.positive, "probability": constraints.unit_interval}
     support = constraints.positive
-    reparametrized_params = ["shortest", "probability"]  # noqa: RUF012
+    reparametrized_params = ["shortest_lengthscale", "probability"]  # noqa: RUF012
 
-    def __init__(self, shortest: ArrayLike, probability: ArrayLike = 0.05, *, validate_args: bool | None = None):
-        checks.positive("shortest", shortest)
+    def __init__(self, shortest_lengthscale: ArrayLike, probability: ArrayLike = 0.05, *,
+                 validate_args: bool | None = None):
+        checks.positive("shortest_lengthscale", shortest_lengthscale)
         _check_probability(probability)
-        self.shortest, self.probability = promote_shapes(jnp.asarray(shortest, float), jnp.asarray(probability, float))
-        batch_shape = jnp.broadcast_shapes(jnp.shape(shortest), jnp.shape(probability))
+        self.shortest_lengthscale, self.probability = promote_shapes(
+            jnp.asarray(shortest_lengthscale, float), jnp.asarray(probability, float))
+        batch_shape = jnp.broadcast_shapes(jnp.shape(shortest_lengthscale), jnp.shape(probability))
         super().__init__(batch_shape=batch_shape, validate_args=validate_args)
 
     @property
     def rate(self) -> jax.Array:
         """Rate r of the exponential distribution of ``lengthscale^(-1/2)``."""
-        return -jnp.log(self.probability) * jnp.sqrt(self.shortest)
+        return -jnp.log(self.probability) * jnp.sqrt(self.shortest_lengthscale)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Draw lengthscales of shape ``sample_shape + batch_shape``."""

@@ -47,7 +47,7 @@ def bind(numpyro_model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y:
         ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
         ...     system = lfm.LatentForceModel(
         ...         lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
         >>> times = np.arange(5.0)
@@ -63,7 +63,7 @@ def bind(numpyro_model: Callable, times: ArrayLike | Mapping[str, ArrayLike], y:
         ...     for name in ("short", "long"):
         ...         system = lfm.LatentForceModel(
         ...             lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
-        ...             lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...             lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...             lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         ...         numpyro.sample(name, lfm.MarginalLikelihood(system, times[name]), obs=y[name])
         >>> both = lfm.bind(experiments, {"short": times[:3], "long": times},

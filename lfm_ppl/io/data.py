@@ -120,10 +120,36 @@ def as_data(data: Any) -> Data:
 def read_series(path: str | Path, column: str, outputs: Sequence[str] | None = None, time_column: str | None = None,
                 inputs: Sequence[str] | Mapping[str, str] = (), time_unit: str | None = None,
                 usual_unit: str | None = None) -> dict[str, Data]:
-    """Read the series of one comma-separated file: identifier -> observations, in the order of the file.
+    r"""Read the series of several subjects, devices or places from one comma-separated file.
 
-    The text in ``column``, as in ``patient``, identifies the series of each row; other arguments: see `read_csv`.
-    Rows of a series need not stand together, but their times must not go back.
+    Args:
+        path: the file, as in `read_csv`.
+        column: the column whose text identifies the series of a row, as in ``patient``. Rows of a series need not
+            stand together, but their times must not go back.
+        outputs: as in `read_csv`; None: also without ``column``.
+        time_column: as in `read_csv`.
+        inputs: as in `read_csv`; each series has its own rows of them.
+        time_unit: unit of the times, as in `read_csv`.
+        usual_unit: as in `read_csv`.
+
+    Returns:
+        Identifier -> observations, in the order of the file. Dates of each series are counted from the midnight before
+        its own first date. `lfm_ppl.stack_series` makes a panel of them, `lfm_ppl.fit_many` fits each alone.
+
+    Raises:
+        ValueError: there is no such column, or a row without an identifier; and as `read_csv`, with the name of the
+            series.
+
+    Warns:
+        UserWarning: as `read_csv`.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "patients.csv"
+        >>> _ = path.write_text("patient,time_h,blood\nAnn,0,9.1\nBo,0,7.9\nAnn,2,5.0\nBo,3,\n")
+        >>> series = read_series(path, "patient")
+        >>> list(series), series["Ann"].y.ravel().tolist(), series["Bo"].times.tolist(), series["Bo"].units
+        (['Ann', 'Bo'], [9.1, 5.0], [0.0, 3.0], {'time': 'h'})
     """
     table = tables.read_file(path)
     if column not in table.frame:

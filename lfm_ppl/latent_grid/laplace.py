@@ -117,7 +117,7 @@ def laplace(latent: LatentGrid, y: ArrayLike, method: str = "trust-region", *, i
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: jnp.exp(u) - x, {"u": lfm.Matern(1.0, 2.0, order=1)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])), lfm.Gaussian(jnp.zeros(1), jnp.zeros(1)))
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.1), lfm.Gaussian(jnp.zeros(1), jnp.zeros(1)))
         >>> grid = lfm.LatentGrid(model, jnp.arange(4.0), points=31)
         >>> result = laplace(grid, jnp.array([[0.0], [0.7], [0.9], [1.0]]))
         >>> bool(result.converged)

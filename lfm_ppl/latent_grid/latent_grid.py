@@ -105,7 +105,7 @@ class LatentGrid(eqx.Module):
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: jnp.exp(u) - x, {"u": lfm.Matern(1.0, 2.0, order=1)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])), lfm.Gaussian(jnp.zeros(1), jnp.zeros(1)))
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.1), lfm.Gaussian(jnp.zeros(1), jnp.zeros(1)))
         >>> grid = LatentGrid(model, jnp.arange(4.0), points=61)
         >>> grid.state(jnp.zeros((1, 61))).shape
         (4, 1)

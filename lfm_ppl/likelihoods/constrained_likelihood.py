@@ -79,7 +79,7 @@ class ConstrainedLikelihood(SeriesLikelihood):
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.3), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> lfm.ConstrainedLikelihood(model, jnp.arange(3.0), lower={"u": 0.0}).constraints_in_words
         'u >= 0 at 21 times'
     """

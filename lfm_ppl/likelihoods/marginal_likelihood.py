@@ -98,7 +98,7 @@ class MarginalLikelihood(SeriesLikelihood):
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.3), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> lfm.MarginalLikelihood(model, jnp.arange(3.0)).event_shape
         (3, 1)
 

@@ -246,7 +246,7 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         >>> def build(p):
         ...     return lfm.LatentForceModel(
         ...         lambda x, u, t: u - p["rate"] * x, {"u": lfm.Matern(1.0, 1.0)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> lfm.panel(build, {"rate": jnp.array([0.5, 1.0])}, jnp.arange(3.0)).batch_shape
         (2,)

@@ -70,7 +70,7 @@ class with_particles(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         >>> import jax, jax.numpy as jnp, numpyro, lfm_ppl as lfm
         >>> def model(times, y=None):
         ...     system = lfm.LatentForceModel(
-        ...         lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1))
         ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
         >>> estimated = with_particles(model, jax.random.key(0), ParticleSettings(100, scheme="srk"))

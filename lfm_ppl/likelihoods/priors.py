@@ -150,7 +150,7 @@ def assumptions(model: LatentForceModel) -> dict[str, str]:
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> noisy = lfm.LatentForceModel(lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 2.0)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])), lfm.Gaussian(jnp.zeros(1), jnp.ones(1)))
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.1), lfm.Gaussian(jnp.zeros(1), jnp.ones(1)))
         >>> for topic, description in assumptions(noisy).items():
         ...     print(f"{topic} | {description}")
         observation | y0: Gaussian (sd 0.1)

@@ -129,7 +129,7 @@ class Dose(Event):
         >>> import jax.numpy as jnp, numpy as np, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: jnp.stack([-x[0], x[0] - 0.2 * x[1]]), {},
-        ...     lfm.GaussianObservation(lambda x, u, t: x[1:], jnp.array([0.01])),
+        ...     lfm.GaussianObservation(lambda x, u, t: x[1:], sd=0.1),
         ...     lfm.Gaussian(jnp.zeros(2), jnp.zeros((2, 2))), state_names=("gut", "blood"), initial_time=0.0,
         ...     events=[lfm.Dose([0.0, 12.0], 4.0, "gut", lag=0.5)])
         >>> result = lfm.filter(model, np.array([0.25, 13.0]), jnp.zeros((2, 1)))
@@ -177,7 +177,7 @@ class Infusion(Event):
     Example:
         >>> import jax.numpy as jnp, numpy as np, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
-        ...     lambda x, u, t: -0.2 * x, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
+        ...     lambda x, u, t: -0.2 * x, {}, lfm.GaussianObservation(lambda x, u, t: x, sd=0.1),
         ...     lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))), state_names=("blood",), initial_time=0.0,
         ...     events=[lfm.Infusion([0.0], 10.0, "blood", duration=2.0)])
         >>> result = lfm.filter(model, np.array([1.0, 2.0, 3.0]), jnp.zeros((3, 1)))
@@ -284,7 +284,7 @@ class Reset(Event):
         >>> weeks = np.arange(1.0, 4.0)
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: u, {"rate": lfm.Matern(1.0, 2.0, mean=3.0)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...     lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))), state_names=("cases",), initial_time=0.0,
         ...     events=[lfm.Reset(weeks, "cases")])
         >>> lfm.filter(model, weeks[:1], jnp.array([[3.0]])).filtered_mean[:, 0].tolist()

@@ -81,7 +81,7 @@ class LatentForceModel(eqx.Module):
         >>> model = lfm.LatentForceModel(
         ...     dynamics=lambda x, u, t: u - 0.5 * x,
         ...     forces={"drive": lfm.Matern(1.0, 2.0)},
-        ...     observation=lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
+        ...     observation=lfm.GaussianObservation(lambda x, u, t: x, sd=0.1),
         ...     initial_state=lfm.Gaussian(jnp.zeros(1), jnp.eye(1)),
         ... )
         >>> model.state_names

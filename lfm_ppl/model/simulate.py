@@ -79,7 +79,7 @@ def simulate(key: jax.Array, model: LatentForceModel, times: Any, steps: int = 5
         >>> import jax, jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
         ...     lambda x, u, t: u - x, {"u": lfm.Matern(1.0, 1.0)},
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.3), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> lfm.simulate(jax.random.key(0), model, jnp.arange(4.0)).y.shape
         (4, 1)
 

@@ -152,7 +152,8 @@ def _score_forces(logarithms: jax.Array, mean: jax.Array, sd: jax.Array, period:
     times, axes = np.array(fixed[0]), fixed[1]
     forces, white = magnitudes.forces(logarithms, axes, period)
     # A value stands for some time, over which white noise averages.
-    errors = jax.vmap(jnp.diag)(sd**2 + white**2 / _APART)
-    system = LatentForceModel(lambda x, u, t: jnp.zeros(1), forces, GaussianObservation(lambda x, u, t: u, errors),
-                              Gaussian(jnp.zeros(1), jnp.zeros((1, 1))))
+    covariance = jax.vmap(jnp.diag)(sd**2 + white**2 / _APART)
+    system = LatentForceModel(
+        lambda x, u, t: jnp.zeros(1), forces, GaussianObservation(lambda x, u, t: u, covariance=covariance),
+        Gaussian(jnp.zeros(1), jnp.zeros((1, 1))))
     return filter(system, times, mean, steps=1).log_likelihood.sum()

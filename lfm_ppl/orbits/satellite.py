@@ -98,7 +98,7 @@ def pushed(dynamics: Callable, start: Gaussian, forces: Mapping[str, Force], axe
                          f"{list(forces)}.")
     push = jnp.concatenate([jnp.zeros((3, 3)), NANO * jnp.asarray(white) * jnp.eye(3)])
     return LatentForceModel(
-        dynamics, dict(forces), GaussianObservation(_position, jnp.asarray(noise_sd) ** 2 * jnp.ones(3)), start,
+        dynamics, dict(forces), GaussianObservation(_position, sd=noise_sd), start,
         process_noise=push, state_names=STATES, output_names=STATES[:3], units=units)
 
 

@@ -179,7 +179,7 @@ def _response(neighbourhood: Neighbourhood, axes: jax.Array, periods: jax.Array 
         push = jnp.concatenate([jnp.zeros((3, 3)), NANO * white * jnp.eye(3)])
         system = LatentForceModel(
             lambda x, u, t: neighbourhood(x, neighbourhood.on_orbit + axis * u[0], t), {"force": force},
-            GaussianObservation(lambda x, u, t: x[:3], jnp.ones(3)), Gaussian(jnp.zeros(6), jnp.eye(6)),
+            GaussianObservation(lambda x, u, t: x[:3], sd=1.0), Gaussian(jnp.zeros(6), jnp.eye(6)),
             process_noise=push)
         return _position_covariances(system, time_array)
 

@@ -138,7 +138,7 @@ def particle_filter(key: jax.Array, model: LatentForceModel, times: ArrayLike, y
     Example:
         >>> import jax, jax.numpy as jnp, lfm_ppl as lfm
         >>> model = lfm.LatentForceModel(
-        ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...     lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...     lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=jnp.eye(1))
         >>> result = lfm.particle_filter(jax.random.key(0), model, jnp.arange(3.0), jnp.ones((3, 1)), particles=100)
         >>> result.scheme

@@ -86,8 +86,8 @@ def joint_model(models: Mapping[str, LatentForceModel], probabilities: jax.Array
         forces=[(name, first.forces[name]) for name in first.force_names],
         observation=GaussianObservation(
             select([model.observation.function for model in members]),
-            select([functools.partial(model.observation.covariance_at, row=0) for model in members]),
-            first.observation.angular, first.observation.period),
+            covariance=select([functools.partial(model.observation.covariance_at, row=0) for model in members]),
+            angular=first.observation.angular, period=first.observation.period),
         initial_state=initial,
         process_noise=_joint_noise(members, size),
         initial_time=first.initial_time,

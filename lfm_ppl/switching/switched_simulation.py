@@ -79,7 +79,7 @@ def simulate_switched(key: jax.Array, build: Build, controller: Controller, time
         >>> def house(heater):
         ...     return lfm.LatentForceModel(
         ...         lambda x, u, t: 0.1 * (5.0 - x) + 2.0 * heater + u, {"rest": lfm.Matern(0.3, 2.0)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
+        ...         lfm.GaussianObservation(lambda x, u, t: x, sd=0.1),
         ...         lfm.Gaussian(jnp.array([18.0]), jnp.eye(1)))
         >>> simulate_switched(jax.random.key(0), house, lfm.Thermostat(20.0), jnp.arange(24.0), paths=5).state.shape
         (24, 5, 1)

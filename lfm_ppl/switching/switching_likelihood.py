@@ -25,6 +25,7 @@ from lfm_ppl.filtering.breakdown import FilterWarning
 from lfm_ppl.filtering.intervals import TimeGrid, with_state_maps
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
+from lfm_ppl.filtering.smoother import MeanSd
 from lfm_ppl.filtering.stiffness import (
     ExplicitSteps,
     explicit_steps,
@@ -57,6 +58,7 @@ from lfm_ppl.switching.switched_model import SwitchedProblem, with_forces_of
 from lfm_ppl.switching.switched_simulation import simulate_paths
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
+from lfm_ppl.utils.linalg import safe_sqrt
 from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.random_keys import split_by_name
 
@@ -71,16 +73,39 @@ class RegimeSmootherResult(eqx.Module):
         times: (K,), requested times.
         probability: (K, R), of the R regimes given all observations.
         mean, covariance: (K, n), (K, n, n), of the joint state of mechanism and forces, merged over the regimes.
+        input_mean, input_covariance: (K, M + R), (K, M + R, M + R) of w = (x, u), merged over the regimes.
         log_likelihood: (T,), log p(y_k | y_1:k-1).
         regimes: names of the regimes.
+        state_names, force_names: names of the M states and the R forces.
     """
 
     times: jax.Array
     probability: jax.Array
     mean: jax.Array
     covariance: jax.Array
+    input_mean: jax.Array
+    input_covariance: jax.Array
     log_likelihood: jax.Array
     regimes: tuple[str, ...] = eqx.field(static=True)
+    state_names: tuple[str, ...] = eqx.field(static=True)
+    force_names: tuple[str, ...] = eqx.field(static=True)
+
+    def state(self, name: str) -> MeanSd:
+        """Return mean (K,) and sd (K,) of a physical state, over the regimes.
+
+        Raises:
+            ValueError: an unknown name; the message lists similar names.
+        """
+        checks.one_of("state", name, self.state_names)
+        return self._marginal(self.state_names.index(name))
+
+    def force(self, name: str) -> MeanSd:
+        """Return mean (K,) and sd (K,) of a force, over the regimes."""
+        checks.one_of("force", name, self.force_names)
+        return self._marginal(len(self.state_names) + self.force_names.index(name))
+
+    def _marginal(self, index: int) -> MeanSd:
+        return MeanSd(self.input_mean[:, index], safe_sqrt(self.input_covariance[:, index, index]))
 
 
 class Switching(SeriesLikelihood):
@@ -122,12 +147,12 @@ class Switching(SeriesLikelihood):
         >>> def build(scale):
         ...     return lfm.LatentForceModel(
         ...         lambda x, u, t: u - x, {"u": lfm.Matern(scale, 1.0)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         >>> switching = Switching({"calm": build(0.1), "rough": build(2.0)}, [[0.0, 0.2], [0.5, 0.0]], jnp.arange(5.0))
         >>> result = switching.smooth(jnp.array([[0.0], [0.1], [2.0], [-1.0], [0.0]]))
-        >>> result.regimes, result.probability.shape
-        (('calm', 'rough'), (5, 2))
+        >>> result.regimes, result.probability.shape, result.force("u").mean.shape
+        (('calm', 'rough'), (5, 2), (5,))
 
     Source: Blom and Bar-Shalom (1988), IEEE Transactions on Automatic Control 33(8), for IMM; Tugnait (1982),
     Automatica 18(5), for GPBn; Lindsten and others (2016), IEEE Journal of Selected Topics in Signal Processing 10(2),
@@ -276,15 +301,25 @@ class Switching(SeriesLikelihood):
         trace = filter_regimes(regimes, y)
         paths, probability = sample_regimes(jax.random.key(0), regimes, trace, y, SMOOTHER_DRAWS)
 
-        def smooth(path: jax.Array) -> Moments:
+        times, model = jnp.asarray(grid.requested_times, float), self.models[0]
+        maps = [jax.vmap(ssm.input_map)(times) for ssm in self.ssms]
+        matrices, offsets = jax.tree.map(lambda *leaves: jnp.stack(leaves), *maps)
+
+        def smooth(path: jax.Array) -> tuple[Moments, Moments]:
+            """Return the moments of the joint state, and of w = (x, u) by the map of the regime at each time."""
             # The nodes of the smoother begin with the initial time.
-            return jax.tree.map(lambda a: a[requested + 1], smooth_path(regimes, y, path).moments)
+            state = jax.tree.map(lambda a: a[requested + 1], smooth_path(regimes, y, path).moments)
+            row = (path[requested], jnp.arange(len(times)))
+            matrix, offset = matrices[row], offsets[row]
+            return state, Moments(jnp.einsum("kwn,kn->kw", matrix, state.mean) + offset,
+                                  jnp.einsum("kwn,knm,kvm->kwv", matrix, state.covariance, matrix))
 
         equal = jnp.ones(SMOOTHER_DRAWS)
-        moments = jax.vmap(lambda row: merge(equal, row), in_axes=1)(jax.vmap(smooth)(paths.T))
+        state, inputs = (jax.vmap(lambda row: merge(equal, row), in_axes=1)(moments)
+                         for moments in jax.vmap(smooth)(paths.T))
         return RegimeSmootherResult(
-            jnp.asarray(grid.requested_times, float), probability[requested], *moments,
-            trace.log_likelihood[jnp.asarray(grid.observed)], self.regime_names)
+            times, probability[requested], *state, *inputs, trace.log_likelihood[jnp.asarray(grid.observed)],
+            self.regime_names, model.state_names, model.force_names)
 
     def scores(self, key: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
         """Return scores and new data, with a path of regimes r as a further parameter of the draw; see the base class.

@@ -130,7 +130,7 @@ def backtest(numpyro_model: Callable, times: Times, y: ArrayLike | None = None, 
         ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
         ...     lfmodel = lfm.LatentForceModel(
         ...         lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), output_names=["x"])
         ...     numpyro.sample("y", lfm.MarginalLikelihood(lfmodel, times), obs=y)
         >>> times = np.arange(12.0)

@@ -102,7 +102,7 @@ def forecast(result: Result, numpyro_model: Callable, times: Times, *, inputs: M
         ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
         ...     lfmodel = lfm.LatentForceModel(
         ...         lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), output_names=["x"])
         ...     numpyro.sample("y", lfm.MarginalLikelihood(lfmodel, times), obs=y)
         >>> times = np.arange(5.0)

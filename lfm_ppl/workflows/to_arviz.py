@@ -86,7 +86,7 @@ def to_arviz(mcmc: Any, numpyro_model: Callable, times: ArrayLike, y: ArrayLike,
         ...     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
         ...     lfmodel = lfm.LatentForceModel(
         ...         lambda x, u, t: u - rate * x, {"u": lfm.Matern(1.0, 1.0)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         ...     numpyro.sample("y", lfm.MarginalLikelihood(lfmodel, times), obs=y)
         >>> times, y = jnp.arange(5.0), jnp.sin(jnp.arange(5.0))[:, None]

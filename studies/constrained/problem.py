@@ -95,7 +95,7 @@ def transcription(lengthscale: Any, scale: Any = 1.0, *, softplus: bool = False)
     return lfm.LatentForceModel(
         lambda x, u, t: SENSITIVITY * (jax.nn.softplus(u) if softplus else u) - DECAY * x,
         {FACTOR: Matern(scale, lengthscale, 1)},
-        lfm.GaussianObservation(_state, jnp.array([NOISE_SD**2])), lfm.Gaussian(jnp.zeros(1), 0.01 * jnp.eye(1)),
+        lfm.GaussianObservation(_state, sd=NOISE_SD), lfm.Gaussian(jnp.zeros(1), 0.01 * jnp.eye(1)),
         process_noise=PROCESS_SD * jnp.eye(1), initial_time=0.0)
 
 
@@ -133,7 +133,7 @@ def companion(lengthscale: Any, mean: Any, weight_lengthscale: Any = None,
     weight = rate if weight_lengthscale is None else np.sqrt(3.0) / weight_lengthscale
     variances = jnp.array([PROCESS_SD**2, 0.0, 4.0 * weight**3, *[0.0] * learnt])
     return lfm.LatentForceModel(
-        Companion(None if learnt else rate), {}, lfm.GaussianObservation(_state, jnp.array([NOISE_SD**2])),
+        Companion(None if learnt else rate), {}, lfm.GaussianObservation(_state, sd=NOISE_SD),
         lfm.Gaussian(jnp.append(mean, rate) if learnt else mean, 0.5 / ARRIVAL * jnp.eye(3 + learnt)),
         process_noise=jnp.sqrt(jnp.diag(variances) / 2.0), initial_time=0.0,
         state_names=("x", FACTOR, "derivative", *["rate"] * learnt))

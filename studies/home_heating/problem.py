@@ -200,7 +200,7 @@ def _simulator(store: str) -> Any:
             home = model.likelihood(values, heater).model
             observation = lfm.GaussianObservation(
                 lambda x, u, t: jnp.append(home.observation.function(x, u, t), heater),
-                jnp.append(home.observation.covariance, _METER_ERROR**2))
+                covariance=jnp.append(home.observation.covariance, _METER_ERROR**2))
             return lfm.LatentForceModel(home.dynamics, home.forces, observation, home.initial_state,
                                         state_names=home.state_names)
 

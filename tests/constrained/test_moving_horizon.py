@@ -75,7 +75,10 @@ def test_one_observation_at_a_time(tmp_path, caplog):
     assert all(estimate.converged for estimate in estimates)
     times = np.array([estimate.time for estimate in estimates])
     assert np.isnan(times[:2]).all() and (times[2:] == TIMES[:10]).all()
-    force = np.array([estimate.force_mean[0] for estimate in estimates])
+    force = np.array([estimate.force("factor").mean for estimate in estimates])
+    assert np.isnan(estimate.force("factor").sd) and estimate.state("x0").mean == estimate.state_mean[0]
+    with pytest.raises(ValueError, match="factr"):
+        estimate.force("factr")
     assert force.min() >= 0.0
     np.testing.assert_allclose(force[WINDOW - 1:], record.force_mean[2:10, 0], atol=1e-7)
 

@@ -233,6 +233,7 @@ def test_equal_regimes_are_one_model(merging):
     smoothed, expected = switching.smooth(y, requested_times), single.smooth(y, requested_times)
     np.testing.assert_allclose(smoothed.mean, expected.mean, atol=1e-9)
     np.testing.assert_allclose(smoothed.covariance, expected.covariance, atol=1e-9)
+    np.testing.assert_allclose(smoothed.state("x0"), expected.state("x0"), atol=1e-9)
     scores = switching.scores(jax.random.key(0), y)
     np.testing.assert_allclose(scores["leave_one_out"][:, 0], expected.leave_one_out, atol=1e-9)
     np.testing.assert_allclose(scores["residual"], expected.whitened_innovation, atol=1e-8)
@@ -379,6 +380,27 @@ def test_a_change_of_the_lengthscale_keeps_the_derivative_of_a_force(merging):
         # The state of the forces is (x, u, u' / rate) with the rate of the first regime.
         scale = np.array([1.0, 1.0, 2.0 / np.sqrt(3.0)])
         np.testing.assert_allclose(smoothed.mean, expected.mean * scale, atol=1e-8)
+        np.testing.assert_allclose(smoothed.force("u"), expected.state("x1"), atol=1e-8)
+
+
+@pytest.mark.thorough
+def test_the_force_of_a_regime_has_its_mean_and_scale():
+    """The system stays in the second regime, whose force has another mean."""
+    def model(mean, scale):
+        return lfm.LatentForceModel(
+            lambda x, u, t: u[:1] + u[1:] - x, {"u": lfm.Matern(scale, 1.0, mean=mean), "v": lfm.Constant(scale)},
+            lfm.GaussianObservation(lambda x, u, t: x, sd=0.2), lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
+
+    times, y = np.array([0.0, 1.0, 1.0, 2.5]), np.array([[0.1], [np.nan], [0.4], [1.0]])
+    requested_times = np.array([0.5, 1.0, 3.0])
+    models = {"low": model(0.0, 1.0), "high": model(3.0, 0.5)}
+    result = lfm.Switching(models, np.zeros((2, 2)), times, initial=[0.0, 1.0]).smooth(y, requested_times)
+    expected = lfm.MarginalLikelihood(models["high"], times).smooth(y, requested_times)
+    for name in ("u", "v"):
+        np.testing.assert_allclose(result.force(name), expected.force(name), atol=1e-9)
+    np.testing.assert_allclose(result.state("x0"), expected.state("x0"), atol=1e-9)
+    with pytest.raises(ValueError, match="'w'"):
+        result.force("w")
 
 
 @pytest.mark.thorough

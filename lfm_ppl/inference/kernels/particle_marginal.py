@@ -120,7 +120,7 @@ class ParticleMarginalRAM(RAM):
         >>> def model(times, y=None):
         ...     noise = numpyro.sample("noise", dist.LogNormal(0.0, 0.5))
         ...     system = lfm.LatentForceModel(
-        ...         lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lambda x, u, t: x - x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)), process_noise=noise * jnp.eye(1))
         ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
         >>> mcmc = MCMC(ParticleMarginalRAM(model, particles=20), num_warmup=20, num_samples=20, progress_bar=False)

@@ -34,7 +34,7 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         >>> def model(times, y=None):
         ...     system = lfm.LatentForceModel(
         ...         lambda x, u, t: u - x**3, {"u": lfm.Matern(1.0, 1.0)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...         lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.eye(1)))
         ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
         >>> finer = lfm.approximate(model, rule=lfm.GaussHermite(7), steps=20)

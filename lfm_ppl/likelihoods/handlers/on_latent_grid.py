@@ -68,7 +68,7 @@ class on_latent_grid(LikelihoodHandler):  # noqa: N801 (an effect handler, named
         >>> def model(times, y=None):
         ...     system = lfm.LatentForceModel(
         ...         lambda x, u, t: jnp.exp(u) - x, {"u": lfm.Matern(1.0, 2.0, order=1)},
-        ...         lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.01])),
+        ...         lfm.GaussianObservation(lambda x, u, t: x, sd=0.1),
         ...         lfm.Gaussian(jnp.zeros(1), jnp.zeros(1)))
         ...     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
         >>> latent = lfm.on_latent_grid(model, points=21)

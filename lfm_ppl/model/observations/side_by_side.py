@@ -56,7 +56,7 @@ class Observations(ObservationFamily):
     Example:
         >>> import jax.numpy as jnp, lfm_ppl as lfm
         >>> observation = lfm.Observations(
-        ...     lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        ...     lfm.GaussianObservation(lambda x, u, t: x, sd=0.3),
         ...     lfm.PoissonObservation(lambda x, u, t: u))
         >>> len(observation.parts)
         2
