@@ -307,7 +307,8 @@ def fit(
             return finished
         store = checkpoints.begin_or_resume(checkpoint, record, resume)
     if progress:
-        print(f"likelihood: {description['likelihood']}", file=sys.stderr, flush=True)
+        if sampler == "map":  # chains may start at the mode, where their likelihood is chosen
+            print(f"likelihood: {description['likelihood']}", file=sys.stderr, flush=True)
         if method_of_chains == "sequential" and chain_method is None and jax.default_backend() == "cpu":
             print(f"The {chains} chains run one after another: JAX has {jax.local_device_count()} of the devices for "
                   f"{chains} chains side by side. Call numpyro.set_host_device_count({chains}) before it computes.",
@@ -397,13 +398,23 @@ def _find_start(problem: FitProblem, store: Checkpoint | None, show_progress: bo
         start = find_start(bound, options, setup)
     if show_progress and setup is None and FALLBACK in start.attributes:
         print(f"note     {start.attributes[FALLBACK]}", file=sys.stderr, flush=True)
-    for name, tuning in start.tunings.items() if show_progress else ():
-        print(f"likelihood: {f'{name}: ' if bound.is_by_site else ''}{tuning}", file=sys.stderr, flush=True)
+    if show_progress:
+        print(f"likelihood: {_likelihood_in_words(start, options)}", file=sys.stderr, flush=True)
     if start.points is not None:
         _warn_of_long_steps(problem, start.points[0] if start.mode is None else start.mode)
     if store is not None and setup is None:
         store.setup = start.setup
     return start
+
+
+def _likelihood_in_words(start: ChainStart, options: FitOptions) -> str:
+    """Return the likelihood of the chains: what was tuned, and how the others are computed."""
+    bound = start.sampler.bound
+    if not start.tunings:
+        return str(options.description(bound)["likelihood"])
+    words = {name: str(start.tunings.get(name, model.site.example.description))
+             for name, model in bound.site_models.items()}
+    return "; ".join(f"{name}: {text}" if bound.is_by_site else text for name, text in words.items())
 
 
 def _sample(problem: FitProblem, start: ChainStart, store: Checkpoint | None, show_progress: bool) -> PosteriorDraws:

@@ -5,8 +5,8 @@
 2. A random walk needs no gradient, but to learn the shape of the posterior by rejection takes thousands of steps. Its
    first proposal covariance is that of the Laplace approximation, and its chains start at draws from it.
 3. Particle-marginal RAM also chooses the number of particles, by default at the mode.
-4. With a usable mode, the likelihood's iterations start from the smoothed moments there, and are as few as suffice
-   (`lfm_ppl.inference.tuning`).
+4. With a usable mode, the likelihood's iterations start from the smoothed moments there, and iterations and integration
+   steps are as few as suffice (`lfm_ppl.inference.tuning`).
 5. A resumed run finds nothing anew: its setup holds the numbers that were chosen before the first step.
 
 Source: `lfm_ppl.inference.laplace_start`; Vihola (2012), Statistics and Computing 22, 997-1008.

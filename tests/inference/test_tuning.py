@@ -1,4 +1,4 @@
-"""Fits whose iterations start at the posterior mode: as few as suffice, and one density wherever it is evaluated."""
+"""Fits from the posterior mode: as few iterations and steps as suffice, and one density wherever it is evaluated."""
 
 import json
 import warnings
@@ -27,7 +27,17 @@ def crossing(times, y=None):
     strength = numpyro.sample("strength", dist.LogNormal(0.0, 0.3))
     dispersion = numpyro.sample("dispersion", dist.LogNormal(-0.3, 0.3))
     system = double_well(0.9, 0.1, dispersion, 0.03, -strength, strength)
-    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=2), obs=y)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+
+def forced(times, y=None):
+    """A known input of jumps, one of which divides an interval, and a force in a non-linear function."""
+    rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.3))
+    pulse = lfm.Input([0.0, 1.2, 2.0], [0.0, 1.0, 0.0], outside="hold")
+    system = lfm.LatentForceModel(
+        lambda x, u, t: jnp.exp(u) + pulse(t) - rate * x, {"u": lfm.Matern(0.5, 1.0, order=1)},
+        lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.2])), lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
 
 def fit(model=crossing, **options):
@@ -46,12 +56,13 @@ def test_a_result_names_its_density_and_gives_it_again(result):
     attrs = ResultView.of(result).attrs
     tuning = json.loads(attrs[ANCHOR])["sites"]["y"]
     assert attrs["iterations"] == tuning["iterations"] in (0, 1, 2, 3, 6)
+    assert attrs["steps"] == 10 and tuning["steps"] in (3, 5) and f", {tuning['steps']} steps" in attrs["likelihood"]
     assert tuning["error"] <= TOLERATED_ERROR or tuning["iterations"] == 6
     assert "smoothed moments" in attrs["likelihood"]
     problem = rebuilding.problem(result, crossing)
     recorded = result["one_step_ahead"]["log_density"].transpose("chain", "draw", ...).values.sum(axis=-1).ravel()
     np.testing.assert_allclose(gaussian(problem), recorded, rtol=1e-9)
-    converged = gaussian(problem, iterations=40)
+    converged = gaussian(problem, iterations=40, steps=20)
     from_filter = gaussian(ModelDraws(lfm.bind(crossing, TIMES, Y), problem.draws))
     assert np.std(recorded - converged) < max(2 * TOLERATED_ERROR, 0.3 * np.std(from_filter - converged))
     mean = lfm.forecast(result, crossing, [4.5], draws=8, progress=False)  # compares log likelihoods
@@ -66,6 +77,28 @@ def test_the_sampler_saw_the_density_that_the_result_names(result):
         assert np.isclose(bound.log_density(z), result["sample_stats"]["lp"].values[chain, draw], rtol=1e-9)
 
 
+@pytest.mark.parametrize("model", [crossing, pytest.param(forced, marks=pytest.mark.thorough)])
+def test_the_fewest_steps_that_suffice_are_chosen(model):
+    bound = lfm.bind(model, TIMES, Y)
+    laplace = laplace_approximation(jax.random.key(0), bound)
+    tuned, tunings = anchor_at_mode(jax.random.key(1), bound, laplace)
+    tuning, settings = tunings["y"], tuned.site.example.settings
+    assert settings.integration_steps == tuning.steps and settings.iterations == tuning.iterations
+    normals = np.asarray(jax.random.normal(jax.random.key(2), (12, bound.size)))
+    draws = laplace.mode + normals @ np.linalg.cholesky(laplace.covariance).T
+
+    def log_likelihoods(**settings):
+        with_settings = bound.anchored(laplace.mode).approximate(**settings)
+        return np.array([with_settings.log_likelihood(z) for z in draws])
+
+    finest = log_likelihoods(iterations=12, steps=40)
+    error = np.std(log_likelihoods(iterations=tuning.iterations, filter_steps=tuning.steps) - finest)
+    assert error < 2 * TOLERATED_ERROR and 0.4 < error / tuning.error < 2.5
+    fewer = {3: None, 5: 3, 10: 5}[tuning.steps]
+    if fewer is not None:
+        assert np.std(log_likelihoods(iterations=tuning.iterations, filter_steps=fewer) - finest) > TOLERATED_ERROR / 2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("options", "iterations"), [
     ({"init": "median"}, 3), ({"sampler": "map", "samples": 20}, 3), ({"iterations": 0}, 0)])
@@ -76,7 +109,7 @@ def test_without_a_mode_or_iterations_nothing_is_tuned(options, iterations):
 
 @pytest.mark.slow
 def test_a_number_that_the_model_names_stays_and_starts_at_the_mode():
-    result = fit(sampler="ram", iterations=2, samples=10, warmup=20, trajectory_draws=0)
+    result = fit(sampler="ram", iterations=2, steps=2, samples=10, warmup=20, trajectory_draws=0)
     attrs = ResultView.of(result).attrs
     assert attrs["iterations"] == 2 and json.loads(attrs[ANCHOR])["sites"] == {"y": {}}
     recorded = result["one_step_ahead"]["log_density"].transpose("chain", "draw", ...).values.sum(axis=-1).ravel()
