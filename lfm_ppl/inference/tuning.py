@@ -116,7 +116,7 @@ def _tune_site(bound: BoundModel, draws: np.ndarray) -> Tuning | None:
     if not has_open_steps:
         return Tuning(iterations, None, difference(iterated, finest))
     half = log_likelihoods(iterations, _FEWER_STEPS[-1])
-    candidates = *_FEWER_STEPS, steps
+    candidates: tuple[int, ...] = (*_FEWER_STEPS, steps)
     if difference(half, iterated) > TOLERATED_ERROR:
         most = 4 * steps
         log_likelihoods = _log_likelihoods_at(bound, draws, most)
