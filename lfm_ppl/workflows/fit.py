@@ -80,7 +80,7 @@ from lfm_ppl.workflows.fit_results import (
     post_process,
     write_result,
 )
-from lfm_ppl.workflows.fit_starts import FALLBACK, ChainStart, check_init, find_start
+from lfm_ppl.workflows.fit_starts import EXPONENTIAL, FALLBACK, ChainStart, check_init, find_start
 
 _MODE = "mode"
 """Name of the mode and its draws in the folder of a run."""
@@ -401,7 +401,9 @@ def _find_start(problem: FitProblem, store: Checkpoint | None, show_progress: bo
     if show_progress:
         print(f"likelihood: {_likelihood_in_words(start, options)}", file=sys.stderr, flush=True)
     if start.points is not None:
-        _warn_of_long_steps(problem, start.points[0] if start.mode is None else start.mode)
+        # Without stiffness, the program that looked for it is there already.
+        _warn_of_long_steps(problem.with_bound(start.sampler.bound) if EXPONENTIAL in start.attributes else problem,
+                            start.points[0] if start.mode is None else start.mode)
     if store is not None and setup is None:
         store.setup = start.setup
     return start

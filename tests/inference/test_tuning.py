@@ -14,6 +14,7 @@ from systems import double_well
 import lfm_ppl as lfm
 from lfm_ppl.accuracy.log_likelihoods import gaussian
 from lfm_ppl.inference.laplace_start import laplace_approximation
+from lfm_ppl.inference.long_steps import stiff_sites
 from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.inference.tuning import ANCHOR, TOLERATED_ERROR, anchor_at_mode
 from lfm_ppl.results import rebuilding
@@ -150,3 +151,30 @@ def test_series_and_sites_have_moments_of_their_own(model, times, y):
     assert set(tunings) == set(bound.site_models)
     assert {name: model.site.example.settings.iterations for name, model in tuned.site_models.items()} == {
         name: tuning.iterations for name, tuning in tunings.items()}
+
+
+def settling(times, y=None):
+    """A state that settles within half a step of the default."""
+    growth = numpyro.sample("growth", dist.LogNormal(0.0, 0.3))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: jnp.stack([growth * x[0] * (1.0 - x[0]) + u[0], 40.0 * (x[0]**2 - x[1])]),
+        {"u": lfm.Matern(0.1, 1.0)}, lfm.GaussianObservation(lambda x, u, t: x[1:], jnp.array([0.1])),
+        lfm.Gaussian(jnp.array([0.2, 0.04]), 0.01 * jnp.eye(2)))
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+
+@pytest.mark.slow
+def test_a_stiff_model_takes_exponential_steps_unless_it_names_others():
+    y = np.array([0.1, 0.15, 0.3, 0.4, 0.55, 0.7, 0.8, 0.85])[:, None]
+    options = {"chains": 1, "warmup": 10, "samples": 10, "trajectory_draws": 0, "progress": False}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        result = lfm.fit(settling, TIMES, y, **options)
+    attrs = ResultView.of(result).attrs
+    assert attrs["method"] == "exponential" and json.loads(attrs[ANCHOR])["sites"]["y"]["steps"] in (3, 5, 10)
+    problem = rebuilding.problem(result, settling)
+    recorded = result["one_step_ahead"]["log_density"].transpose("chain", "draw", ...).values.sum(axis=-1).ravel()
+    np.testing.assert_allclose(gaussian(problem), recorded, rtol=1e-9)
+    assert np.std(gaussian(problem, steps=100, method="runge-kutta", iterations=12) - recorded) < 2 * TOLERATED_ERROR
+    assert stiff_sites(lfm.bind(settling, TIMES, y), np.zeros(1)) == ["y"]
+    assert not stiff_sites(lfm.bind(lfm.approximate(settling, steps=10), TIMES, y), np.zeros(1))
