@@ -132,7 +132,10 @@ def _long_steps(likelihood: SeriesLikelihood) -> list[str]:
     has_equal_steps = any(integrator.stepping is Stepping.EQUAL for integrator in likelihood.integrators)
     if not has_equal_steps or length is None or not lengthscales:
         return []
-    step, longest = float(length.max()) / grid.steps, 0.5 * min(lengthscales)
+    # Fewer steps of the filter alone are taken where their error is known to be small.
+    settings = likelihood.settings
+    steps = grid.steps * settings.steps / settings.integration_steps
+    step, longest = float(length.max()) / steps, 0.5 * min(lengthscales)
     if step <= longest:
         return []
     remedy = f"{0.9 * longest:.2g}"  # rounded, it must not exceed the limit

@@ -116,7 +116,7 @@ def finer_tolerance(tolerance: float) -> float:
 
 def finer_steps(example: SeriesLikelihood) -> dict[str, Any]:
     """Return the settings of a likelihood with about twice as many integration steps."""
-    settings: dict[str, Any] = {"steps": 2 * example.settings.steps}
+    settings: dict[str, Any] = {"steps": 2 * example.settings.integration_steps}
     if example.settings.max_step is not None:
         settings["max_step"] = example.settings.max_step / 2
     if example.settings.tolerance is not None:

@@ -90,6 +90,40 @@ class TimeGrid(NamedTuple):
     since: Any = None
 
 
+def divide_intervals(grid: TimeGrid, count: Any, most: int) -> TimeGrid:
+    """Return the grid whose intervals are ``count`` intervals of one step each, of equal lengths.
+
+    The number may be traced: each interval becomes ``most`` of them, the last ones of length zero, so that one program
+    serves all numbers.
+
+    Args:
+        grid: the time grid.
+        count: steps in each interval, at most ``most``.
+        most: number of intervals for each.
+    """
+    old = as_arrays(grid.intervals)
+    part = jnp.arange(most)
+    is_step, is_last = part < count, part == most - 1
+    step = (jnp.asarray(old.length, float) / count)[:, None]
+    start = jnp.where(is_step, old.start[:, None] + part * step, old.end[:, None])
+    end = jnp.where(part + 1 < count, old.start[:, None] + (part + 1) * step, old.end[:, None])
+    since = jnp.asarray(grid.since)[:, None] + jnp.minimum(part, count) * step
+    length = jnp.where(is_step, step, 0.0)
+    depth = jnp.minimum(jnp.asarray(old.inset)[:, None], 0.5 * length)
+    lengths, length_index = grid.lengths, jnp.zeros(length.shape, int)
+    if lengths is not None:
+        length_index = jnp.where(is_step, old.length_index[:, None], len(lengths))
+        lengths = jnp.append(jnp.asarray(lengths) / count, 0.0)
+    observation, jump, event = (jnp.where(is_last, index[:, None], -1) for index in (
+        old.observation, old.jump, old.event))
+    fields = (start, length, observation, jump, length_index, end, depth, event)
+    intervals = Intervals(*(jnp.reshape(field, -1) for field in fields))
+    observed, requested = (jnp.asarray(index) * most + most - 1 for index in (grid.observed, grid.requested))
+    # Without a branch, intervals of length zero would take the time of a step.
+    return grid._replace(intervals=intervals, lengths=lengths, observed=observed, requested=requested, steps=1,
+                         replicated=True, since=since.reshape(-1))
+
+
 def as_arrays(intervals: Intervals) -> Intervals:
     """Return the intervals as JAX arrays, which a scan can run over."""
     return jax.tree.map(jnp.asarray, intervals)

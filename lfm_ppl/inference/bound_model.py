@@ -614,7 +614,7 @@ class BoundModel:
         if not example.has_explicit_steps:
             return None
         explicit = self.explicit_steps(z, y, requested_times)
-        return long_step_message(explicit, example.ssm.model.state_names, example.settings.steps,
+        return long_step_message(explicit, example.ssm.model.state_names, example.settings.integration_steps,
                                  has_method and "method" in example.accepted, example.regime_names)
 
     def _check_single(self, name: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
@@ -20,3 +22,23 @@ def long_step_messages(bound: BoundModel, z: np.ndarray, has_method: bool = True
         if (message := site_model.long_step_message(z, has_method=has_method)) is not None:
             messages.append(f"site {name!r}: {message}" if bound.is_by_site else message)
     return messages
+
+
+def stiff_sites(bound: BoundModel, z: np.ndarray) -> list[str]:
+    """Return the names of likelihood sites with a step that is too long, where the model leaves steps and method open.
+
+    Args:
+        bound: the model and its data.
+        z: (d,), concrete.
+    """
+    return [name for name, model in bound.site_models.items()
+            if "method" in model.site.example.accepted
+            and not model.site.example.given & {"steps", "filter_steps", "max_step", "tolerance", "method"}
+            and model.long_step_message(z) is not None]
+
+
+def with_exponential_steps(bound: BoundModel, sites: Iterable[str]) -> BoundModel:
+    """Return the model with exponential steps at likelihood sites of these names."""
+    for name in sites:
+        bound = bound.site_models[name].approximate(method="exponential").with_all_sites()
+    return bound

@@ -83,7 +83,7 @@ def plan_paths(bound: BoundModel, requested_times: np.ndarray | None, simulated:
     # The first requested time pads the times between requested ones, of which series have different numbers.
     rows = [np.insert(times, count, np.repeat(times[0], length - len(times)))
             for times in (plan.times for plan in plans) if times is not None]
-    smoother_steps = [_steps_per_interval(series.ssm, times, row, series.settings.steps)
+    smoother_steps = [_steps_per_interval(series.ssm, times, row, series.settings.integration_steps)
                       for series, times, row in zip(members, bound.times, rows, strict=True)]
     return PathPlan(np.array(rows), plans[0].requested, np.arange(length - data, length),
                  max(plan.steps for plan in plans), max(smoother_steps))

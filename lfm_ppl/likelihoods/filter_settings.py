@@ -21,6 +21,7 @@ class FilterSettings:
     Attributes:
         rule: linearisation rule.
         steps: integration steps between two consecutive times.
+        filter_steps: those of the filter and the smoother, where another number is right; None: ``steps``.
         max_step: longest step; None: twice the median step.
         iterations: of posterior linearisation; `MarginalLikelihood` puts its default here, which depends on the model.
         damping: largest share of each new iterate that is taken.
@@ -31,12 +32,18 @@ class FilterSettings:
 
     rule: Rule = Cubature()
     steps: int = 10
+    filter_steps: int | None = None
     max_step: float | None = None
     iterations: int = 0
     damping: float = 0.7
     tolerance: float | None = None
     method: str = DEFAULT_METHOD
     factors: FactorSettings | None = None
+
+    @property
+    def integration_steps(self) -> int:
+        """Integration steps of the filter and the smoother; steps that follow a tolerance take ``steps``."""
+        return self.steps if self.filter_steps is None or self.tolerance is not None else self.filter_steps
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -55,6 +62,9 @@ class FilterSettings:
             named_settings["rule"] = as_rule(named_settings["rule"])
         check_iterations(named_settings.get("iterations"), named_settings.get("damping", cls.damping),
                          named_settings.get("tolerance"))
+        if "filter_steps" in named_settings:
+            checks.positive_integer("filter_steps", named_settings["filter_steps"],
+                                    "It is a number of integration steps.")
         if "tolerance" in named_settings:
             checks.positive("tolerance", named_settings["tolerance"],
                             "It is in standard deviations, 0.001 for example.")

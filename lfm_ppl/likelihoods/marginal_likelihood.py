@@ -23,7 +23,9 @@ from lfm_ppl.filtering.ep.evidence import Evidence, evidence
 from lfm_ppl.filtering.ep.settings import FactorSettings, as_settings
 from lfm_ppl.filtering.ep.terms import FamilyTerms
 from lfm_ppl.filtering.forward import forward
+from lfm_ppl.filtering.intervals import divide_intervals
 from lfm_ppl.filtering.iterated import Anchor, converged_anchor, number_of_iterations, posterior_linearisation
+from lfm_ppl.filtering.problem import filter_problem
 from lfm_ppl.filtering.update import GaussianUpdate
 from lfm_ppl.likelihoods.filter_settings import FilterSettings
 from lfm_ppl.likelihoods.series_likelihood import SeriesLikelihood, check_model, repeat_draw
@@ -79,6 +81,8 @@ class MarginalLikelihood(SeriesLikelihood):
         method: of integration, "runge-kutta" (explicit, the default), or "exponential" for stiff dynamics: its steps of
             order three are stable at any rate of decay, and each costs about ten explicit steps. It works
             with a ``tolerance``.
+        filter_steps: integration steps of the filter and the smoother, where fewer than ``steps`` suffice; simulations
+            and particle filters still take ``steps``. None: ``steps``.
         about: smoothed moments from which the iterations start, which leaves a fifth of the errors at the same cost:
             ``bound.anchor(z)`` of a bound model or ``likelihood.anchor(y)`` at a point of high density, of the same
             model and rule; at other times, or with other steps, they are interpolated. They are held fixed in the
@@ -110,14 +114,14 @@ class MarginalLikelihood(SeriesLikelihood):
     def __init__(self, model: LatentForceModel, times: ArrayLike, rule: Rule | None = None, steps: int | None = None,
                  max_step: float | None = None, iterations: int | None = None, damping: float | None = None,
                  tolerance: float | None = None, factors: FactorSettings | str | None = None, *,
-                 method: str | None = None, about: Anchor | None = None, validate_args: bool | None = None,
-                 **unknown: Any):
+                 method: str | None = None, filter_steps: int | None = None, about: Anchor | None = None,
+                 validate_args: bool | None = None, **unknown: Any):
         for name in unknown:
             remedy = "; constraints are arguments of lfm.ConstrainedLikelihood" if name in CONSTRAINTS else ""
             raise TypeError(f"MarginalLikelihood has no argument {name!r}{remedy}.")
         check_model(model)
         arguments = {"rule": rule, "steps": steps, "max_step": max_step, "iterations": iterations, "damping": damping,
-                     "tolerance": tolerance, "method": method, "factors": factors}
+                     "tolerance": tolerance, "method": method, "factors": factors, "filter_steps": filter_steps}
         settings, setting_names = FilterSettings.of(arguments)
         if factors is not None and not isinstance(model.observation, ObservationFamily):
             raise ValueError("factors are for an observation family such as lfm.PoissonObservation; the observation of "
@@ -150,15 +154,27 @@ class MarginalLikelihood(SeriesLikelihood):
         about = None if self.about is None else self.about.on_grid(self.time_grid, True)
         return converged_anchor(self.problem, GaussianUpdate(self.checked(y)), self.settings.damping, about)
 
-    def log_likelihood_after(self, y: jax.Array, iterations: jax.Array) -> jax.Array:
+    def log_likelihood_after(self, y: jax.Array, iterations: jax.Array, steps: jax.Array,
+                             most_steps: int | None = None) -> jax.Array:
         """Return the log likelihood of ``y`` (T, D) after a traced number of iterations from an anchor.
 
         It has no derivative in reverse mode, and one program serves all numbers.
+
+        Args:
+            y: (T, D), NaN where missing.
+            iterations: number of iterations.
+            steps: traced number of integration steps between two times; it has no effect without ``most_steps``.
+            most_steps: largest number of them; None: the steps of the distribution.
         """
         assert self.about is not None
-        problem, updater = self.problem, GaussianUpdate(y)
+        grid = self.time_grid
+        if most_steps is not None:
+            # Where breakpoints divide an interval between two times, its parts have their share of the steps.
+            part, own = grid.steps, self.settings.integration_steps
+            grid = divide_intervals(grid, -(-part * steps // own), -(-part * most_steps // own))
+        problem, updater = filter_problem(self.ssm, self.settings.rule, grid), GaussianUpdate(y)
         points = posterior_linearisation(problem, updater, iterations, self.settings.damping,
-                                         self.about.on_grid(self.time_grid, True)).points
+                                         self.about.on_grid(grid, most_steps is None)).points
         return forward(problem, updater, about=points).log_likelihood.sum()
 
     @property
@@ -177,13 +193,14 @@ class MarginalLikelihood(SeriesLikelihood):
             return "linear model, integrated " + (
                 f"in {settings.steps} steps between two times" if settings.tolerance is None
                 else f"with tolerance {settings.tolerance:g}")
+        steps = "" if settings.filter_steps is None else f", {settings.integration_steps} steps"
         if not settings.iterations:
             single = "a single pass of the filter" if self.about is None else "linearised about smoothed moments"
-            return f"approximate ({single})"
+            return f"approximate ({single}{steps})"
         start = "" if self.about is None else " from smoothed moments"
         count = {1: "one iteration", 2: "two iterations", 3: "three iterations"}.get(
             settings.iterations, f"{settings.iterations} iterations")
-        return f"approximate ({count} of posterior linearisation{start})"
+        return f"approximate ({count} of posterior linearisation{start}{steps})"
 
     @property
     def factor_settings(self) -> FactorSettings:

@@ -176,7 +176,7 @@ class Panel(Likelihood):
         if not first.has_explicit_steps or not np.isfinite(np.asarray(log_likelihood)).all():
             return
         explicit_steps = Program(lambda y: self.mapped(lambda series, y: series.explicit_steps(y), y))
-        warn_of_message(long_step_message(explicit_steps(y), first.model.state_names, first.settings.steps))
+        warn_of_message(long_step_message(explicit_steps(y), first.model.state_names, first.settings.integration_steps))
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Simulate every series: (*sample_shape, B, T, D)."""
@@ -214,7 +214,7 @@ class Panel(Likelihood):
 def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayLike, rule: Rule | None = None,
           steps: int | None = None, max_step: float | None = None, iterations: int | None = None,
           damping: float | None = None, tolerance: float | None = None, factors: FactorSettings | str | None = None,
-          method: str | None = None, about: Anchor | None = None) -> Panel:
+          method: str | None = None, filter_steps: int | None = None, about: Anchor | None = None) -> Panel:
     """Return many independent series as one distribution, for use inside ``numpyro.plate``.
 
     The plate's name is the dimension of the series in the result of `lfm_ppl.fit`; `lfm_ppl.select_series` returns one
@@ -232,6 +232,7 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         tolerance: largest error of an integration step, in standard deviations; None for equal steps.
         factors: of an observation family.
         method: of integration.
+        filter_steps: of filter and smoother, where fewer than ``steps`` suffice; see `MarginalLikelihood`.
         about: smoothed moments of all series from which the iterations start, ``bound.anchor(z)``, with a leading
             axis (B,).
 
@@ -252,5 +253,5 @@ def panel(build: Callable[..., LatentForceModel], parameters: Any, times: ArrayL
         (2,)
     """
     arguments = {"rule": rule, "steps": steps, "max_step": max_step, "iterations": iterations, "damping": damping,
-                 "tolerance": tolerance, "factors": factors, "method": method}
+                 "tolerance": tolerance, "factors": factors, "method": method, "filter_steps": filter_steps}
     return Panel(build, parameters, times, arguments, about)

@@ -120,14 +120,15 @@ class SeriesLikelihood(Likelihood):
     @functools.cached_property
     def _laid_out(self) -> tuple[GridLayout, list[InputRead], EventTable]:
         settings = self.settings
-        return lay_out_time_grid(self.ssm, self.times, settings.steps, settings.max_step, tolerance=settings.tolerance)
+        return lay_out_time_grid(self.ssm, self.times, settings.integration_steps, settings.max_step,
+                                 tolerance=settings.tolerance)
 
     def lay_out(self, requested_times: Any = None) -> GridLayout:
         """Return the layout of the time grid with requested times (K,); None: the times of the data."""
         if requested_times is None:
             return self._laid_out[0]
         settings = self.settings
-        return lay_out_time_grid(self.ssm, self.times, settings.steps, settings.max_step, requested_times,
+        return lay_out_time_grid(self.ssm, self.times, settings.integration_steps, settings.max_step, requested_times,
                                  tolerance=settings.tolerance)[0]
 
     def grid_of(self, layout: GridLayout) -> TimeGrid:
@@ -247,8 +248,8 @@ class SeriesLikelihood(Likelihood):
         """
         y = self.checked(y)
         result = self._filter(y)
-        warn_of_long_steps(self.ssm, self.settings.rule, self.time_grid, self.settings.steps, result.filtered_mean,
-                           result.log_likelihood)
+        warn_of_long_steps(self.ssm, self.settings.rule, self.time_grid, self.settings.integration_steps,
+                           result.filtered_mean, result.log_likelihood)
         return result
 
     def _filter(self, y: jax.Array) -> FilterResult:
@@ -256,7 +257,7 @@ class SeriesLikelihood(Likelihood):
 
     def warn_of_long_steps(self, y: jax.Array, log_likelihood: jax.Array) -> None:
         """Warn where a step is too long for a fast decay, outside of compiled code; y (T, D) is checked."""
-        warn_of_long_steps(self.ssm, self.settings.rule, self.time_grid, self.settings.steps,
+        warn_of_long_steps(self.ssm, self.settings.rule, self.time_grid, self.settings.integration_steps,
                            lambda: self._filter(y).filtered_mean, log_likelihood)
 
     @property
@@ -283,8 +284,9 @@ class SeriesLikelihood(Likelihood):
         if isinstance(requested_times, GridLayout):
             return self.grid_of(requested_times)
         settings = self.settings
-        return build_time_grid(self.ssm, self.times, settings.steps if steps is None else steps, settings.max_step,
-                               requested_times, tolerance=settings.tolerance)._replace(method=settings.method)
+        return build_time_grid(self.ssm, self.times, settings.integration_steps if steps is None else steps,
+                               settings.max_step, requested_times,
+                               tolerance=settings.tolerance)._replace(method=settings.method)
 
     def smooth(self, y: Any, at: Any = None, steps: int | None = None) -> SmootherResult:
         """Smooth with this distribution's settings, or with other ``steps``; see `lfm_ppl.smooth`.
@@ -294,7 +296,7 @@ class SeriesLikelihood(Likelihood):
         Args:
             y: (T, D), NaN where missing.
             at: (K,) requested times, or the result of `lay_out` for them; None: the times of the data.
-            steps: integration steps between two consecutive times; None: `steps` of the distribution.
+            steps: integration steps between two consecutive times; None: those of the distribution.
         """
         grid, y = self.smoother_grid(at, steps), self.checked(y)
         about = None if self.about is None else self.about.on_grid(grid, at is None and steps is None)
@@ -302,7 +304,8 @@ class SeriesLikelihood(Likelihood):
                            self.factor_settings, about)
         if not self.is_family:
             warn_of_iterations(result.change, result.log_likelihood_change)
-        warn_of_long_steps(self.ssm, self.settings.rule, grid, self.settings.steps if steps is None else steps,
+        warn_of_long_steps(self.ssm, self.settings.rule, grid,
+                           self.settings.integration_steps if steps is None else steps,
                            lambda: filtered_mean(result, grid), result.log_likelihood)
         return result
 

@@ -288,7 +288,8 @@ def fit(
             return finished
         store = checkpoints.begin_or_resume(checkpoint, record, resume)
     if progress:
-        print(f"likelihood: {description['likelihood']}", file=sys.stderr, flush=True)
+        if sampler == "map":  # chains may start at the mode, where their likelihood is chosen
+            print(f"likelihood: {description['likelihood']}", file=sys.stderr, flush=True)
         if method_of_chains == "sequential" and chain_method is None and jax.default_backend() == "cpu":
             print(f"The {chains} chains run one after another: JAX has {jax.local_device_count()} of the devices for "
                   f"{chains} chains side by side. Call numpyro.set_host_device_count({chains}) before it computes.",

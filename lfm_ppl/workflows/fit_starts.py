@@ -5,9 +5,11 @@
 2. A random walk needs no gradient, but to learn the shape of the posterior by rejection takes thousands of steps. Its
    first proposal covariance is that of the Laplace approximation, and its chains start at draws from it.
 3. Particle-marginal RAM also chooses the number of particles, by default at the mode.
-4. With a usable mode, the likelihood's iterations start from the smoothed moments there, and are as few as suffice
-   (`lfm_ppl.inference.tuning`).
-5. A resumed run finds nothing anew: its setup holds the numbers that were chosen before the first step.
+4. With a usable mode, the likelihood's iterations start from the smoothed moments there, and iterations and integration
+   steps are as few as suffice (`lfm_ppl.inference.tuning`).
+5. Where an explicit step is too long for a fast decay at the mode, and the model leaves steps and method open, the
+   mode is searched again with exponential steps.
+6. A resumed run finds nothing anew: its setup holds the numbers that were chosen before the first step.
 
 Source: `lfm_ppl.inference.laplace_start`; Vihola (2012), Statistics and Computing 22, 997-1008.
 """
@@ -15,6 +17,7 @@ Source: `lfm_ppl.inference.laplace_start`; Vihola (2012), Statistics and Computi
 from __future__ import annotations
 
 import dataclasses
+import json
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -36,6 +39,7 @@ from lfm_ppl.inference.laplace_start import (
     laplace_approximation,
     starting_points,
 )
+from lfm_ppl.inference.long_steps import stiff_sites, with_exponential_steps
 from lfm_ppl.inference.map import MAPResult, mode_of
 from lfm_ppl.inference.tuning import ANCHOR, Tuning, anchor_at_mode, anchor_attribute, anchored
 from lfm_ppl.utils import checks
@@ -48,7 +52,10 @@ FALLBACK = "init_fallback"
 _WARMUP, _SHORT_WARMUP = 1000, 300
 """Default warm-up draws of each chain; the short one is that of NUTS from the Laplace approximation."""
 
-_SETUP = ("particles", "log_likelihood_sd", "warmup", "init", FALLBACK, ANCHOR)
+EXPONENTIAL = "exponential_steps"
+"""Attribute of a result, as JSON: the likelihood sites with exponential steps, because explicit ones were too long."""
+
+_SETUP = ("particles", "log_likelihood_sd", "warmup", "init", FALLBACK, EXPONENTIAL, ANCHOR)
 """Attributes that a resumed run needs."""
 
 
@@ -104,14 +111,18 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
         return nuts_sampler(bound, num_warmup, sampler_options, laplace if is_regularized else None)
 
     if setup is not None:
+        bound = with_exponential_steps(bound, json.loads(setup.get(EXPONENTIAL, "[]")))
         # The stored state holds the approximation; the program needs its shapes only.
         shapes = Laplace(np.zeros(bound.size), np.eye(bound.size)) if setup["init"] == "laplace" else None
         return ChainStart(sampler(anchored(bound, setup), shapes, setup["warmup"]), None, dict(setup))
-    laplace, fallback = None, {}
+    laplace, fallback, stiff = None, {}, []
     is_at_mode = options.init in (None, "map")
     if is_at_mode:
         try:
             laplace = laplace_approximation(options.keys["mode"], bound)
+            if stiff := _stiff_sites(bound, laplace.mode):
+                bound = with_exponential_steps(bound, stiff)
+                laplace = laplace_approximation(options.keys["mode"], bound)
         except UnusableModeError as error:
             fallback = {FALLBACK: f"the chains start at the prior median, with a unit mass matrix: {error}"}
     default_warmup = _SHORT_WARMUP if laplace is not None and is_regularized else _WARMUP
@@ -124,17 +135,19 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
         nuts = dataclasses.replace(nuts, slow_warmup_hint="")
     if laplace is not None:
         points = starting_points(options.keys["starts"], bound, laplace, options.chains)
-        attributes = {"warmup": warmup, "init": "laplace", **anchor_attribute(bound, tunings)}
+        attributes = {"warmup": warmup, "init": "laplace", **_stiff_attribute(stiff),
+                      **anchor_attribute(bound, tunings)}
         return ChainStart(nuts, points, attributes, mode=laplace.mode, tunings=tunings)
     strategy = init_to_median if is_at_mode else _strategy(options)
     points = _starting_points(bound, options, strategy, nuts.evaluate)
     init = "strategy" if callable(options.init) else "median"
-    return ChainStart(nuts, points, {"warmup": warmup, "init": init, **fallback})
+    return ChainStart(nuts, points, {"warmup": warmup, "init": init, **_stiff_attribute(stiff), **fallback})
 
 
 def _find_random_walk_start(bound: BoundModel, options: FitOptions, setup: Mapping[str, Any] | None) -> ChainStart:
     kernel_type, sampler_options = KERNELS[options.sampler], dict(options.sampler_options)
     if setup is not None:
+        bound = with_exponential_steps(bound, json.loads(setup.get(EXPONENTIAL, "[]")))
         bound, kernel = anchored(bound, setup), kernel_type(bound.model, **sampler_options)
         if isinstance(kernel, ParticleMarginalRAM):
             kernel.prepare(bound, None, Tuned(int(setup["particles"]), float(setup["log_likelihood_sd"])))
@@ -143,6 +156,10 @@ def _find_random_walk_start(bound: BoundModel, options: FitOptions, setup: Mappi
     has_covariance = "initial_covariance" in sampler_options
     tunings: dict[str, Tuning] = {}
     mode = None if has_covariance and options.init != "map" else _find_mode(bound, options)
+    stiff: list[str] = []
+    if mode is not None and options.sampler != "pmmh" and (stiff := _stiff_sites(bound, mode.mode)):
+        bound = with_exponential_steps(bound, stiff)
+        mode = _find_mode(bound, options)
     strategy = _strategy(options, mode)
     # Without a usable covariance the mode is a starting point only.
     if mode is not None and (has_covariance or mode.unidentified or not np.all(np.isfinite(mode.covariance))):
@@ -162,7 +179,7 @@ def _find_random_walk_start(bound: BoundModel, options: FitOptions, setup: Mappi
     if isinstance(kernel, ParticleMarginalRAM):
         kernel.prepare(bound, points[0])
     start = _random_walk_start(bound, options, kernel, points)
-    attributes = {**start.attributes, **anchor_attribute(bound, tunings)}
+    attributes = {**start.attributes, **_stiff_attribute(stiff), **anchor_attribute(bound, tunings)}
     return dataclasses.replace(start, attributes=attributes, mode=None if mode is None else mode.mode, tunings=tunings)
 
 
@@ -176,6 +193,18 @@ def _random_walk_start(bound: BoundModel, options: FitOptions, kernel: RAM, poin
                   "delayed": int(kernel.delayed), "warmup": warmup}
     particle_options = {"particle_settings": kernel.settings, "particle_steps": kernel.particle_steps}
     return ChainStart(particle_marginal_sampler(bound, num_warmup, kernel), points, attributes, particle_options)
+
+
+def _stiff_sites(bound: BoundModel, z: np.ndarray) -> list[str]:
+    """Return `stiff_sites`; none where a function of the model has no derivative in forward mode."""
+    try:
+        return stiff_sites(bound, z)
+    except Exception:  # of any kind; the check before the sampling says which
+        return []
+
+
+def _stiff_attribute(sites: list[str]) -> dict[str, str]:
+    return {EXPONENTIAL: json.dumps(sites)} if sites else {}
 
 
 def _find_mode(bound: BoundModel, options: FitOptions) -> MAPResult:

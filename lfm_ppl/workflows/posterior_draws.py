@@ -27,6 +27,7 @@ from lfm_ppl.results import arviz_data
 from lfm_ppl.storage.checkpoint import Checkpoint
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.progress import waiting
+from lfm_ppl.workflows.fit_options import FitOptions
 from lfm_ppl.workflows.fit_results import (
     FitProblem,
     PosteriorDraws,
@@ -35,7 +36,7 @@ from lfm_ppl.workflows.fit_results import (
     build_result,
     write_result,
 )
-from lfm_ppl.workflows.fit_starts import FALLBACK, ChainStart, check_init, find_start
+from lfm_ppl.workflows.fit_starts import EXPONENTIAL, FALLBACK, ChainStart, check_init, find_start
 
 _MODE = "mode"
 """Name of the mode and its draws in the folder of a run."""
@@ -68,13 +69,25 @@ def find_chain_start(problem: FitProblem, store: Checkpoint | None, show_progres
         start = find_start(bound, options, setup)
     if show_progress and setup is None and FALLBACK in start.attributes:
         print(f"note     {start.attributes[FALLBACK]}", file=sys.stderr, flush=True)
-    for name, tuning in start.tunings.items() if show_progress else ():
-        print(f"likelihood: {f'{name}: ' if bound.is_by_site else ''}{tuning}", file=sys.stderr, flush=True)
+    if show_progress:
+        print(f"likelihood: {_likelihood_in_words(start, options)}", file=sys.stderr, flush=True)
     if start.points is not None:
-        _warn_of_long_steps(problem, start.points[0] if start.mode is None else start.mode)
+        # Without stiffness, the program that looked for it is there already.
+        _warn_of_long_steps(problem.with_bound(start.sampler.bound) if EXPONENTIAL in start.attributes else problem,
+                            start.points[0] if start.mode is None else start.mode)
     if store is not None and setup is None:
         store.setup = start.setup
     return start
+
+
+def _likelihood_in_words(start: ChainStart, options: FitOptions) -> str:
+    """Return the likelihood of the chains: what was tuned, and how the others are computed."""
+    bound = start.sampler.bound
+    if not start.tunings:
+        return str(options.description(bound)["likelihood"])
+    words = {name: str(start.tunings.get(name, model.site.example.description))
+             for name, model in bound.site_models.items()}
+    return "; ".join(f"{name}: {text}" if bound.is_by_site else text for name, text in words.items())
 
 
 def sample_chains(problem: FitProblem, start: ChainStart, store: Checkpoint | None,

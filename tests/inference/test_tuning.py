@@ -1,4 +1,4 @@
-"""Fits whose iterations start at the posterior mode: as few as suffice, and one density wherever it is evaluated."""
+"""Fits from the posterior mode: as few iterations and steps as suffice, and one density wherever it is evaluated."""
 
 import json
 import warnings
@@ -14,6 +14,7 @@ from systems import double_well
 import lfm_ppl as lfm
 from lfm_ppl.accuracy.log_likelihoods import gaussian
 from lfm_ppl.inference.laplace_start import laplace_approximation
+from lfm_ppl.inference.long_steps import stiff_sites
 from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.inference.tuning import ANCHOR, TOLERATED_ERROR, anchor_at_mode
 from lfm_ppl.results import rebuilding
@@ -27,7 +28,17 @@ def crossing(times, y=None):
     strength = numpyro.sample("strength", dist.LogNormal(0.0, 0.3))
     dispersion = numpyro.sample("dispersion", dist.LogNormal(-0.3, 0.3))
     system = double_well(0.9, 0.1, dispersion, 0.03, -strength, strength)
-    numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=2), obs=y)
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+
+def forced(times, y=None):
+    """A known input of jumps, one of which divides an interval, and a force in a non-linear function."""
+    rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.3))
+    pulse = lfm.Input([0.0, 1.2, 2.0], [0.0, 1.0, 0.0], outside="hold")
+    system = lfm.LatentForceModel(
+        lambda x, u, t: jnp.exp(u) + pulse(t) - rate * x, {"u": lfm.Matern(0.5, 1.0, order=1)},
+        lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.2])), lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
 
 def fit(model=crossing, **options):
@@ -46,12 +57,13 @@ def test_a_result_names_its_density_and_gives_it_again(result):
     attrs = ResultView.of(result).attrs
     tuning = json.loads(attrs[ANCHOR])["sites"]["y"]
     assert attrs["iterations"] == tuning["iterations"] in (0, 1, 2, 3, 6)
+    assert attrs["steps"] == 10 and tuning["steps"] in (3, 5) and f", {tuning['steps']} steps" in attrs["likelihood"]
     assert tuning["error"] <= TOLERATED_ERROR or tuning["iterations"] == 6
     assert "smoothed moments" in attrs["likelihood"]
     problem = rebuilding.problem(result, crossing)
     recorded = result["one_step_ahead"]["log_density"].transpose("chain", "draw", ...).values.sum(axis=-1).ravel()
     np.testing.assert_allclose(gaussian(problem), recorded, rtol=1e-9)
-    converged = gaussian(problem, iterations=40)
+    converged = gaussian(problem, iterations=40, steps=20)
     from_filter = gaussian(ModelDraws(lfm.bind(crossing, TIMES, Y), problem.draws))
     assert np.std(recorded - converged) < max(2 * TOLERATED_ERROR, 0.3 * np.std(from_filter - converged))
 
@@ -70,6 +82,28 @@ def test_the_sampler_saw_the_density_that_the_result_names(result):
         assert np.isclose(bound.log_density(z), result["sample_stats"]["lp"].values[chain, draw], rtol=1e-9)
 
 
+@pytest.mark.parametrize("model", [crossing, pytest.param(forced, marks=pytest.mark.thorough)])
+def test_the_fewest_steps_that_suffice_are_chosen(model):
+    bound = lfm.bind(model, TIMES, Y)
+    laplace = laplace_approximation(jax.random.key(0), bound)
+    tuned, tunings = anchor_at_mode(jax.random.key(1), bound, laplace)
+    tuning, settings = tunings["y"], tuned.site.example.settings
+    assert settings.integration_steps == tuning.steps and settings.iterations == tuning.iterations
+    normals = np.asarray(jax.random.normal(jax.random.key(2), (12, bound.size)))
+    draws = laplace.mode + normals @ np.linalg.cholesky(laplace.covariance).T
+
+    def log_likelihoods(**settings):
+        with_settings = bound.anchored(laplace.mode).approximate(**settings)
+        return np.array([with_settings.log_likelihood(z) for z in draws])
+
+    finest = log_likelihoods(iterations=12, steps=40)
+    error = np.std(log_likelihoods(iterations=tuning.iterations, filter_steps=tuning.steps) - finest)
+    assert error < 2 * TOLERATED_ERROR and 0.4 < error / tuning.error < 2.5
+    fewer = {3: None, 5: 3, 10: 5}[tuning.steps]
+    if fewer is not None:
+        assert np.std(log_likelihoods(iterations=tuning.iterations, filter_steps=fewer) - finest) > TOLERATED_ERROR / 2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("options", "iterations"), [
     ({"init": "median"}, 3), ({"sampler": "map", "samples": 20}, 3), ({"iterations": 0}, 0)])
@@ -80,7 +114,7 @@ def test_without_a_mode_or_iterations_nothing_is_tuned(options, iterations):
 
 @pytest.mark.slow
 def test_a_number_that_the_model_names_stays_and_starts_at_the_mode():
-    result = fit(sampler="ram", iterations=2, samples=10, warmup=20, trajectory_draws=0)
+    result = fit(sampler="ram", iterations=2, steps=2, samples=10, warmup=20, trajectory_draws=0)
     attrs = ResultView.of(result).attrs
     assert attrs["iterations"] == 2 and json.loads(attrs[ANCHOR])["sites"] == {"y": {}}
     recorded = result["one_step_ahead"]["log_density"].transpose("chain", "draw", ...).values.sum(axis=-1).ravel()
@@ -121,3 +155,30 @@ def test_series_and_sites_have_moments_of_their_own(model, times, y):
     assert set(tunings) == set(bound.site_models)
     assert {name: model.site.example.settings.iterations for name, model in tuned.site_models.items()} == {
         name: tuning.iterations for name, tuning in tunings.items()}
+
+
+def settling(times, y=None):
+    """A state that settles within half a step of the default."""
+    growth = numpyro.sample("growth", dist.LogNormal(0.0, 0.3))
+    system = lfm.LatentForceModel(
+        lambda x, u, t: jnp.stack([growth * x[0] * (1.0 - x[0]) + u[0], 40.0 * (x[0]**2 - x[1])]),
+        {"u": lfm.Matern(0.1, 1.0)}, lfm.GaussianObservation(lambda x, u, t: x[1:], jnp.array([0.1])),
+        lfm.Gaussian(jnp.array([0.2, 0.04]), 0.01 * jnp.eye(2)))
+    numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
+
+
+@pytest.mark.slow
+def test_a_stiff_model_takes_exponential_steps_unless_it_names_others():
+    y = np.array([0.1, 0.15, 0.3, 0.4, 0.55, 0.7, 0.8, 0.85])[:, None]
+    options = {"chains": 1, "warmup": 10, "samples": 10, "trajectory_draws": 0, "progress": False}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        result = lfm.fit(settling, TIMES, y, **options)
+    attrs = ResultView.of(result).attrs
+    assert attrs["method"] == "exponential" and json.loads(attrs[ANCHOR])["sites"]["y"]["steps"] in (3, 5, 10)
+    problem = rebuilding.problem(result, settling)
+    recorded = result["one_step_ahead"]["log_density"].transpose("chain", "draw", ...).values.sum(axis=-1).ravel()
+    np.testing.assert_allclose(gaussian(problem), recorded, rtol=1e-9)
+    assert np.std(gaussian(problem, steps=100, method="runge-kutta", iterations=12) - recorded) < 2 * TOLERATED_ERROR
+    assert stiff_sites(lfm.bind(settling, TIMES, y), np.zeros(1)) == ["y"]
+    assert not stiff_sites(lfm.bind(lfm.approximate(settling, steps=10), TIMES, y), np.zeros(1))

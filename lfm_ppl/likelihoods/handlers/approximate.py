@@ -10,8 +10,8 @@ from lfm_ppl.likelihoods.handlers.likelihood_handler import LikelihoodHandler
 from lfm_ppl.likelihoods.likelihood import Likelihood
 from lfm_ppl.likelihoods.marginal_likelihood import MarginalLikelihood
 
-NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "method", "factors", "lower", "upper",
-         "constraints", "grid", "draws")
+NAMES = ("rule", "steps", "max_step", "iterations", "damping", "tolerance", "method", "filter_steps", "factors",
+         "lower", "upper", "constraints", "grid", "draws")
 
 
 class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as NumPyro names its handlers)
@@ -20,9 +20,10 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
     Args:
         numpyro_model: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
         **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping``, ``tolerance``, ``method``,
-            ``factors``, ``lower``, ``upper``, ``constraints``, ``grid`` and ``draws``; what is None or left out
-            stays as the model has it. But ``steps`` or ``iterations`` without a tolerance remove the tolerance of the
-            model, and a tolerance or constraints remove its iterations.
+            ``filter_steps``, ``factors``, ``lower``, ``upper``, ``constraints``, ``grid`` and ``draws``; what is None
+            or left out stays as the model has it. But ``steps`` are those of the filter, too, unless these are named;
+            ``steps`` or ``iterations`` without a tolerance remove the tolerance of the model, and a tolerance or
+            constraints remove its iterations.
 
     Raises:
         TypeError: for a setting of another name.
@@ -64,7 +65,8 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         """Return the likelihood with the new settings."""
         has_equal_steps = "steps" in self.settings or self.settings.get("iterations", 0) > 0
         is_single_pass = any(self.settings.get(name) for name in ("tolerance", "lower", "upper", "constraints"))
-        ended = ["tolerance"] * has_equal_steps + ["iterations"] * is_single_pass
+        ended = (["tolerance"] * has_equal_steps + ["iterations"] * is_single_pass
+                 + ["filter_steps"] * ("steps" in self.settings))
         settings = {name: None for name in ended if name in likelihood.arguments} | self.settings
         if isinstance(likelihood, MarginalLikelihood):  # bounds make it another class
             new = likelihood_with(likelihood.model, likelihood.times, likelihood.arguments | settings)
