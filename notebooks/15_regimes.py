@@ -60,7 +60,7 @@ times = 0.25 * np.arange(193)
 def room(loss, noise_sd):
     return lfm.LatentForceModel(
         lambda x, u, t: loss * (5.0 - x) + u, {"heat": lfm.Matern(1.0, 4.0, order=0, mean=3.0)},
-        lfm.GaussianObservation(lambda x, u, t: x, noise_sd**2 * jnp.ones(1)),
+        lfm.GaussianObservation(lambda x, u, t: x, sd=noise_sd),
         lfm.Gaussian(jnp.array([20.0]), jnp.eye(1)), state_names=("temperature",),
         units={"time": "h", "temperature": "degC"})
 
@@ -78,7 +78,7 @@ top.plot(times, y, ".", color="0.4", ms=3, label="data")
 top.plot(times, smoothed.mean[:, 0], color="#0072B2", label="smoothed mean")
 top.plot(times, path[:, 0], color="k", lw=0.8, ls="--", label="truth")
 top.set(ylabel="temperature (degC)")
-top.legend(frameon=False, ncols=3)
+top.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 bottom.plot(times, smoothed.probability[:, 1], color="#D55E00", label="probability given all data")
 bottom.fill_between(times, np.asarray(path[:, 2]), step="mid", color="0.85", label="truth")
 bottom.set(xlabel="time (h)", ylabel="window open", ylim=(0, 1.05))
