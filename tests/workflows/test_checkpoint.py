@@ -151,7 +151,7 @@ def test_a_stop_after_sampling_costs_no_draw(full_run, tmp_path, monkeypatch):
     assert "log_likelihood" in ResultView.of(partial).groups and "trajectories" not in ResultView.of(partial).groups
     xr.testing.assert_identical(ResultView.of(partial).posterior, ResultView.of(full_run(sampler)).posterior)
     # Nothing is searched or sampled again.
-    for module in ("workflows.fit", "workflows.fit_starts", "inference.laplace_start"):
+    for module in ("workflows.posterior_draws", "workflows.fit_starts", "inference.laplace_start"):
         monkeypatch.setattr(f"lfm_ppl.{module}.mode_of", stop)
     assert_same(fit(sampler, checkpoint=tmp_path, resume=True), full_run(sampler))
 
