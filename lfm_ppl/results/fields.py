@@ -34,9 +34,9 @@ def evaluate_field(result: Any, field: Any, points: Any = None, *, sensors: Any 
         length_unit: unit of length.
 
     Returns:
-        Variables ``draws`` (chain, draw, at, place) given the states and forces; ``mean`` and ``sd`` (at, place), the
-        sd with the variance beyond the forces of a `SeparableField`; ``truth`` (at, place) where it is known. The
-        places are ``r`` (place, axis).
+        Variables ``draws`` (chain, draw, time, place) given the states and forces; ``mean`` and ``sd`` (time, place),
+        the sd with the variance beyond the forces of a `SeparableField`; ``truth`` (time, place) where it is known.
+        The places are ``r`` (place, axis).
 
     Raises:
         ValueError: the result has no trajectories of the states or forces of the field.

@@ -115,7 +115,7 @@ class Switching(SeriesLikelihood):
 
         p(r(t + dt) = j | r(t) = i) = exp(rates dt)_ij,    dx = f_r(x, u, t) dt + ...,    y_k ~ N(h_r(x, u, t_k), R_r).
 
-    The regime is that of the next observation between two observations. The K regimes share one scan; states that come
+    Between two rows the system follows the regime of the later row. The K regimes share one scan; states that come
     from different regimes are merged by their mean and covariance. The density is exact where the merged states have
     equal moments, and where a regime begins with a state that does not depend on the past.
 

@@ -190,9 +190,10 @@ def fit(
           other entries and theta, which make ``az.loo`` right for dependent data;
         - ``log_prior``: the log prior density of each parameter, for ``az.psense_summary``;
         - ``one_step_ahead``: log p(y_k | y_1:k-1, theta) and standardised residuals;
-        - ``trajectories``: forces, states, deterministics and noise-free outputs at ``at``, given the data; from the
-          Gaussian smoother, and for "pmmh" from the particle smoother. Where densities are known, mean and 95% interval
-          of each (``forces_summary`` and so on) and of new data (``new_data_summary``);
+        - ``trajectories``: forces, states, deterministics and ``outputs``, the expected values of the observations, at
+          ``at``, given the data; from the Gaussian smoother, and for "pmmh" from the particle smoother. Where densities
+          are known, mean and 95% interval of each (``forces_summary`` and so on) and of new data
+          (``new_data_summary``);
         - ``posterior_predictive``: replicated data along a path of states and forces given the data, one for each draw.
           (``numpyro.infer.Predictive`` with the same draws simulates NEW forces instead.)
         - ``predictions``: with ``at``, new observations at these times, with noise; see `forecast`;
