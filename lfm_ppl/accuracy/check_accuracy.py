@@ -204,7 +204,7 @@ def _assess(view: ResultView, draw_index: np.ndarray, filtered: np.ndarray, doub
         step_change_sd=float(change.std()), noise_sd=noise_sd, noise_share=_share(noise_sd, ratio),
         particles=reference.particles, checked=ratio.size,
         available=posterior.sizes["chain"] * posterior.sizes["draw"], impossible=int(np.isneginf(ratio).sum()),
-        sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.settings.steps,
+        sampler=str(attrs.get("sampler", "")), refit=_refit(attrs), steps=example.settings.integration_steps,
         max_step=example.settings.max_step, tolerance=example.settings.tolerance)
     if iterated is not None and (refinement := more_iterations(example)) is not None:
         findings = replace(findings, iterations=refinement.settings["iterations"], ratio_sd=finite_sd(ratio),
@@ -224,7 +224,7 @@ def _assess(view: ResultView, draw_index: np.ndarray, filtered: np.ndarray, doub
         "ess": efficiency * weights.ess,
         "particles": reference.particles, "particles_limited": int(reference.limited), "noise_sd": noise_sd,
         "noise_share": findings.noise_share, "step_change_mean": float(change.mean()),
-        "step_change_sd": findings.step_change_sd, "steps": example.settings.steps,
+        "step_change_sd": findings.step_change_sd, "steps": example.settings.integration_steps,
         "available_draws": findings.available,
         "verdict": verdict.word, "reason": verdict.reason, "command": verdict.command,
         "remedies": json.dumps(verdict.remedies)}))

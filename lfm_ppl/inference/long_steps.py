@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from lfm_ppl.inference.bound_model import BoundModel
+from lfm_ppl.likelihoods.likelihood import Likelihood
 
 
 def long_step_messages(bound: BoundModel, z: np.ndarray, has_method: bool = True) -> list[str]:
@@ -32,7 +33,8 @@ def stiff_sites(bound: BoundModel, z: np.ndarray) -> list[str]:
         z: (d,), concrete.
     """
     return [name for name, model in bound.site_models.items()
-            if "method" in model.site.example.accepted
+            if isinstance(bound.unbound.at_medians[name]["fn"], Likelihood)  # and no mask or expansion of one
+            and "method" in model.site.example.accepted
             and not model.site.example.given & {"steps", "filter_steps", "max_step", "tolerance", "method"}
             and model.long_step_message(z) is not None]
 

@@ -86,16 +86,25 @@ def tune(key: jax.Array, bound: BoundModel, laplace: Laplace) -> dict[str, Tunin
     return {name: tuning for name, tuning in tunings.items() if tuning is not None}
 
 
-def _has_open_steps(example: SeriesLikelihood) -> bool:
-    """Return whether the model leaves the number of steps open, and takes some."""
+def _has_open_steps(bound: BoundModel) -> bool:
+    """Return whether the model leaves the number of steps open, and takes it between any two times.
+
+    Where known inputs or events divide many intervals between two times, each part takes fewer steps. Another number
+    then divides the intervals in another way, so that one grid cannot stand for all numbers.
+    """
+    example, members = bound.site.example, bound.site.members
     has_steps = any(integrator.stepping is Stepping.EQUAL for integrator in example.integrators)
-    return has_steps and not example.given & {"steps", "filter_steps", "max_step"}
+    if not has_steps or example.given & {"steps", "filter_steps", "max_step"}:
+        return False
+    if bound.times.ndim > 1 and any(series.model.events or series.model.input_reads(0.0, 1.0) for series in members):
+        return False  # the grids of series with times of their own are laid out in the program
+    return all(series.time_grid.steps == series.settings.steps for series in members)
 
 
 def _tune_site(bound: BoundModel, draws: np.ndarray) -> Tuning | None:
     """Return the settings of a site; None where none are open, or where the filter breaks down at most draws."""
     example = bound.site.example
-    has_open_steps, has_open_iterations = _has_open_steps(example), "iterations" not in example.given
+    has_open_steps, has_open_iterations = _has_open_steps(bound), "iterations" not in example.given
     if not (has_open_steps or has_open_iterations):
         return None
     steps, iterations = example.settings.steps, example.settings.iterations

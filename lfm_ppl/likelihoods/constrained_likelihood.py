@@ -222,7 +222,7 @@ def likelihood_with(model: LatentForceModel, times: Any, settings: Mapping[str, 
     if not any(constraints.get(name) for name in ("lower", "upper", "constraints")):
         return MarginalLikelihood(model, times, **settings)
     rule, steps = settings.pop("rule", None), settings.pop("steps", None)
-    for name in ("max_step", "tolerance"):
+    for name in ("max_step", "tolerance", "filter_steps"):
         if settings.get(name) is not None:
             raise ValueError(f"{name} is not supported under constraints, which add rows to the grid; raise steps.")
     if (method := settings.get("method") or DEFAULT_METHOD) != DEFAULT_METHOD:

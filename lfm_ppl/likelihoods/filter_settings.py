@@ -42,8 +42,8 @@ class FilterSettings:
 
     @property
     def integration_steps(self) -> int:
-        """Integration steps of the filter and the smoother; steps that follow a tolerance take ``steps``."""
-        return self.steps if self.filter_steps is None or self.tolerance is not None else self.filter_steps
+        """Integration steps of the filter and the smoother."""
+        return self.steps if self.filter_steps is None else self.filter_steps
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -65,6 +65,8 @@ class FilterSettings:
         if "filter_steps" in named_settings:
             checks.positive_integer("filter_steps", named_settings["filter_steps"],
                                     "It is a number of integration steps.")
+            if "tolerance" in named_settings:
+                raise ValueError("a tolerance chooses its own steps; leave filter_steps or tolerance out.")
         if "tolerance" in named_settings:
             checks.positive("tolerance", named_settings["tolerance"],
                             "It is in standard deviations, 0.001 for example.")

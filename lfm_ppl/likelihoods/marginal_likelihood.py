@@ -268,7 +268,8 @@ class MarginalLikelihood(SeriesLikelihood):
         lengths = checks.concrete(self.time_grid.intervals.length)
         if times is not None and lengths is not None and not checks.traced(initial_time):
             if self.settings.tolerance is None:
-                longest = float(lengths.max(initial=0.0)) / self.time_grid.steps / SIMULATION_STEPS
+                grid_steps = self.time_grid.steps * self.settings.steps / self.settings.integration_steps
+                longest = float(lengths.max(initial=0.0)) / grid_steps / SIMULATION_STEPS
                 program = replace(program, breakpoints=divide_steps(times, initial_time, steps, breakpoints, longest))
             program = program.resolved(times, float(initial_time))
 

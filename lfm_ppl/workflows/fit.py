@@ -138,12 +138,14 @@ def fit(
             real arrays of the same shapes compiles nothing, with the exceptions of `lfm.bind`.
         fixed: fixed parameters: name -> value, ``{"decay": 0.8}`` or ``{"decay[CDKN1A]": 0.8}``.
         rule: linearisation rule of the likelihoods, where the model leaves it open; as in `MarginalLikelihood`.
-        steps: the same for the integration steps between two consecutive times.
+        steps: the same for the integration steps between two consecutive times. Where steps and iterations are tuned
+            (see ``iterations``), filter and smoother take the fewest of 3, 5, 10 and 20 steps, by the same criterion.
         iterations: the same for the iterations of posterior linearisation. With a usable mode (see ``init``) and the
             samplers "nuts" and "ram" they start from the smoothed moments there. By default they are as few as keep the
             error of the log likelihood below 0.1 over the posterior, a standard deviation over 20 draws of the Laplace
             approximation; a line says how many. 0 is a single pass of the filter.
-        method: the same for the method of integration.
+        method: the same for the method of integration. By default, with "nuts" or "ram", it is "exponential" where an
+            explicit step is too long for a fast decay at the mode and the model leaves the steps open, too.
         init: starting points. By default, or with "map", draws about the posterior mode. For NUTS they come from the
             Laplace approximation N(mode, C) widened to twice its standard deviations. C, the inverse Hessian, is the
             (dense) inverse mass matrix at the start of the warm-up, and its estimates are regularised towards C. Where

@@ -43,6 +43,7 @@ from lfm_ppl.inference.long_steps import stiff_sites, with_exponential_steps
 from lfm_ppl.inference.map import MAPResult, mode_of
 from lfm_ppl.inference.tuning import ANCHOR, Tuning, anchor_at_mode, anchor_attribute, anchored
 from lfm_ppl.utils import checks
+from lfm_ppl.utils.interruption import was_interrupt
 from lfm_ppl.utils.random_keys import split_keys
 from lfm_ppl.workflows.fit_options import FitOptions
 
@@ -124,6 +125,7 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
                 bound = with_exponential_steps(bound, stiff)
                 laplace = laplace_approximation(options.keys["mode"], bound)
         except UnusableModeError as error:
+            laplace = None
             fallback = {FALLBACK: f"the chains start at the prior median, with a unit mass matrix: {error}"}
     default_warmup = _SHORT_WARMUP if laplace is not None and is_regularized else _WARMUP
     warmup = default_warmup if options.warmup is None else options.warmup
@@ -199,7 +201,9 @@ def _stiff_sites(bound: BoundModel, z: np.ndarray) -> list[str]:
     """Return `stiff_sites`; none where a function of the model has no derivative in forward mode."""
     try:
         return stiff_sites(bound, z)
-    except Exception:  # of any kind; the check before the sampling says which
+    except Exception as error:  # of any kind; the check before the sampling says which
+        if was_interrupt(error):
+            raise KeyboardInterrupt from error
         return []
 
 

@@ -72,8 +72,9 @@ def find_chain_start(problem: FitProblem, store: Checkpoint | None, show_progres
     if show_progress:
         print(f"likelihood: {_likelihood_in_words(start, options)}", file=sys.stderr, flush=True)
     if start.points is not None:
-        # Without stiffness, the program that looked for it is there already.
-        _warn_of_long_steps(problem.with_bound(start.sampler.bound) if EXPONENTIAL in start.attributes else problem,
+        # With the steps of the model, the program that looked for stiffness is there already.
+        has_new_steps = EXPONENTIAL in start.attributes or any(tuning.steps for tuning in start.tunings.values())
+        _warn_of_long_steps(problem.with_bound(start.sampler.bound) if has_new_steps else problem,
                             start.points[0] if start.mode is None else start.mode)
     if store is not None and setup is None:
         store.setup = start.setup
@@ -85,8 +86,9 @@ def _likelihood_in_words(start: ChainStart, options: FitOptions) -> str:
     bound = start.sampler.bound
     if not start.tunings:
         return str(options.description(bound)["likelihood"])
+    stiff_sites = json.loads(start.attributes.get(EXPONENTIAL, "[]"))
     words = {name: str(start.tunings.get(name, model.site.example.description))
-             for name, model in bound.site_models.items()}
+             + (", exponential steps" if name in stiff_sites else "") for name, model in bound.site_models.items()}
     return "; ".join(f"{name}: {text}" if bound.is_by_site else text for name, text in words.items())
 
 

@@ -13,12 +13,13 @@ from systems import double_well
 
 import lfm_ppl as lfm
 from lfm_ppl.accuracy.log_likelihoods import gaussian
-from lfm_ppl.inference.laplace_start import laplace_approximation
+from lfm_ppl.inference.laplace_start import Laplace, UnusableModeError, laplace_approximation
 from lfm_ppl.inference.long_steps import stiff_sites
 from lfm_ppl.inference.model_draws import ModelDraws
 from lfm_ppl.inference.tuning import ANCHOR, TOLERATED_ERROR, anchor_at_mode
 from lfm_ppl.results import rebuilding
 from lfm_ppl.results.result_view import ResultView
+from lfm_ppl.workflows import fit_starts
 
 TIMES = 0.5 * np.arange(1, 9)
 Y = np.array([0.9, 1.1, 0.7, 0.5, 0.1, -0.6, -0.8, -1.1])[:, None]
@@ -182,3 +183,65 @@ def test_a_stiff_model_takes_exponential_steps_unless_it_names_others():
     assert np.std(gaussian(problem, steps=100, method="runge-kutta", iterations=12) - recorded) < 2 * TOLERATED_ERROR
     assert stiff_sites(lfm.bind(settling, TIMES, y), np.zeros(1)) == ["y"]
     assert not stiff_sites(lfm.bind(lfm.approximate(settling, steps=10), TIMES, y), np.zeros(1))
+
+
+@pytest.mark.slow
+def test_an_unusable_mode_of_exponential_steps_leaves_the_prior_median(monkeypatch):
+    searches = []
+
+    def search(*arguments):
+        searches.append(arguments)
+        if len(searches) > 1:
+            raise UnusableModeError("the posterior has several modes of similar height")
+        return laplace_approximation(*arguments)
+
+    monkeypatch.setattr(fit_starts, "laplace_approximation", search)
+    monkeypatch.setattr(fit_starts, "stiff_sites", lambda bound, z: ["y"])
+    attrs = ResultView.of(fit(chains=1, warmup=10, samples=10, trajectory_draws=0)).attrs
+    assert attrs["init"] == "median" and "several modes" in attrs[fit_starts.FALLBACK] and ANCHOR not in attrs
+    assert attrs["method"] == "exponential"
+
+
+def test_a_masked_likelihood_keeps_its_steps():
+    def masked(times, y=None):
+        with numpyro.handlers.mask(mask=jnp.array(True)):
+            settling(times, y)
+
+    assert not stiff_sites(lfm.bind(masked, TIMES, Y), np.zeros(1))
+
+
+@pytest.mark.thorough
+def test_steps_are_not_tuned_where_an_input_divides_most_intervals():
+    table = np.linspace(0.0, 3.0, 61)
+
+    def driven(times, y=None):
+        rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.3))
+        pulses = lfm.Input(table, np.sin(table), outside="hold")
+        system = lfm.LatentForceModel(
+            lambda x, u, t: jnp.exp(u) + pulses(t) - rate * x, {"u": lfm.Matern(0.5, 1.0)},
+            lfm.GaussianObservation(lambda x, u, t: x, sd=0.4), lfm.Gaussian(jnp.ones(1), 0.1 * jnp.eye(1)))
+        numpyro.sample("y", lfm.MarginalLikelihood(system, times, iterations=1), obs=y)
+
+    bound = lfm.bind(driven, TIMES, Y)
+    assert bound.site.example.time_grid.steps < bound.site.example.settings.steps
+    tuned, tunings = anchor_at_mode(jax.random.key(1), bound, Laplace(np.zeros(1), np.eye(1)))
+    assert not tunings and tuned.site.example.settings.integration_steps == 10
+
+
+def test_steps_of_the_filter_are_its_own():
+    likelihood = lfm.MarginalLikelihood(double_well(0.9, 0.1, 0.7, 0.03), [0.5, 1.0, 4.0], filter_steps=3, iterations=0)
+    assert "3 steps" in likelihood.description and likelihood.time_grid.steps == 3
+    with pytest.raises(ValueError, match="leave filter_steps or tolerance out"):
+        lfm.MarginalLikelihood(likelihood.model, TIMES, filter_steps=3, tolerance=1e-3)
+    bounded = lfm.approximate(crossing, filter_steps=3, lower={"x": 0.0})
+    with pytest.raises(ValueError, match="filter_steps is not supported under constraints"):
+        lfm.bind(bounded, TIMES, Y)
+
+
+@pytest.mark.thorough
+def test_simulations_do_not_depend_on_the_steps_of_the_filter():
+    def paths(**settings):
+        well = double_well(0.9, 0.1, 0.7, 0.03)
+        return lfm.MarginalLikelihood(well, [0.5, 1.0, 4.0], iterations=0, **settings).sample(jax.random.key(0), (2,))
+
+    np.testing.assert_array_equal(paths(filter_steps=3), paths())

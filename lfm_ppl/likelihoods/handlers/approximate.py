@@ -66,7 +66,7 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         has_equal_steps = "steps" in self.settings or self.settings.get("iterations", 0) > 0
         is_single_pass = any(self.settings.get(name) for name in ("tolerance", "lower", "upper", "constraints"))
         ended = (["tolerance"] * has_equal_steps + ["iterations"] * is_single_pass
-                 + ["filter_steps"] * ("steps" in self.settings))
+                 + ["filter_steps"] * ("steps" in self.settings or is_single_pass))
         settings = {name: None for name in ended if name in likelihood.arguments} | self.settings
         if isinstance(likelihood, MarginalLikelihood):  # bounds make it another class
             new = likelihood_with(likelihood.model, likelihood.times, likelihood.arguments | settings)
