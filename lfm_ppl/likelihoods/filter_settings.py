@@ -21,7 +21,7 @@ class FilterSettings:
     Attributes:
         rule: linearisation rule.
         steps: integration steps between two consecutive times.
-        filter_steps: those of the filter and the smoother, where another number is right; None: ``steps``.
+        filter_steps: the number for filter and smoother, where it is another one; None: ``steps``.
         max_step: longest step; None: twice the median step.
         iterations: of posterior linearisation; `MarginalLikelihood` puts its default here, which depends on the model.
         damping: largest share of each new iterate that is taken.

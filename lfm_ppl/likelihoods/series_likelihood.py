@@ -296,7 +296,7 @@ class SeriesLikelihood(Likelihood):
         Args:
             y: (T, D), NaN where missing.
             at: (K,) requested times, or the result of `lay_out` for them; None: the times of the data.
-            steps: integration steps between two consecutive times; None: those of the distribution.
+            steps: integration steps between two consecutive times; None: as many as the distribution takes.
         """
         grid, y = self.smoother_grid(at, steps), self.checked(y)
         about = None if self.about is None else self.about.on_grid(grid, at is None and steps is None)

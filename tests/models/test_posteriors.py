@@ -32,7 +32,7 @@ def test_chains_converge_and_cover_the_truth(name, options):
         assert all(np.isfinite(variable).all() for variable in view.group(name).data_vars.values()), name
     posterior, truth = view.posterior, view.group("truth")
     ranks = []
-    for parameter in [name for name in file.parameters if name in posterior]:  # others are those of an option
+    for parameter in [name for name in file.parameters if name in posterior]:  # some are of another option
         draws = posterior[parameter].stack(sample=("chain", "draw"))
         ranks += np.ravel((draws < truth[parameter]).mean("sample")).tolist()
     # one data set: a rank beyond these has a probability of 1e-3 for each parameter

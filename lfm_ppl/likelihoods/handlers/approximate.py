@@ -21,8 +21,8 @@ class approximate(LikelihoodHandler):  # noqa: N801 (an effect handler, named as
         numpyro_model: a NumPyro model with a site ``MarginalLikelihood`` or ``panel``.
         **settings: any of ``rule``, ``steps``, ``max_step``, ``iterations``, ``damping``, ``tolerance``, ``method``,
             ``filter_steps``, ``factors``, ``lower``, ``upper``, ``constraints``, ``grid`` and ``draws``; what is None
-            or left out stays as the model has it. But ``steps`` are those of the filter, too, unless these are named;
-            ``steps`` or ``iterations`` without a tolerance remove the tolerance of the model, and a tolerance or
+            or left out stays as the model has it. But ``steps`` hold for the filter, too, unless ``filter_steps`` are
+            named; ``steps`` or ``iterations`` without a tolerance remove the tolerance of the model, and a tolerance or
             constraints remove its iterations.
 
     Raises:
