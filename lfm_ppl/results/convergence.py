@@ -55,7 +55,7 @@ def messages(summary: pd.DataFrame, chains: int, draws: int, divergences: int) -
     high = sound["r_hat"][sound["r_hat"] > MAX_R_HAT].sort_values(ascending=False)
     if len(high):
         warnings_found.append(
-            f"R-hat is above {MAX_R_HAT} for {join_names(_with_values(high, '.3f'))}: the chains have not reached the "
+            f"R-hat is above {MAX_R_HAT} for {join_names(_with_values(high, '.4f'))}: the chains have not reached the "
             "same distribution. Run longer (warmup, samples); if it stays, look at the trace plot for several modes "
             "and for parameters that the data do not identify.")
     minimum = MIN_ESS_PER_CHAIN * chains
