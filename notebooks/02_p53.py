@@ -188,7 +188,7 @@ published = {
 figure, panels = plt.subplots(1, 2, figsize=(7.0, 2.8), layout="constrained")
 colours, shapes = ("#0072B2", "#D55E00", "#009E73", "#CC79A7"), "osD^"
 for axes, (name, values) in zip(panels, published.items(), strict=True):
-    for shift, (link, colour, shape) in enumerate(zip(results, colours, shapes, strict=True)):
+    for shift, (link, colour, shape) in enumerate(zip(results, colours, shapes, strict=False)):
         table = genes(results[link]).filter(like=name, axis=1)
         low, middle, high = table.to_numpy().T
         bar_positions = np.arange(len(table)) + 0.15 * (shift - 1.5)
@@ -208,7 +208,7 @@ plt.show()
 # %%
 response, gamma = transcription.definitions["activity"], transcription.options["gamma"][0]
 figure, panels = plt.subplots(1, 4, figsize=(7.0, 2.2), layout="constrained")
-for axes, colour, (link, link_result) in zip(panels, colours, results.items(), strict=True):
+for axes, colour, (link, link_result) in zip(panels, colours, results.items(), strict=False):
     trajectories = link_result["trajectories"]
     force = trajectories["forces"].isel(force=0).stack(sample=("chain", "draw"))
     activity = np.asarray(response(jax.numpy.asarray(force.transpose("time", "sample").values), link, gamma))
