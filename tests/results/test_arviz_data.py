@@ -216,7 +216,7 @@ def test_convergence_warnings_name_parameters_and_values(datasets):
     broken = arviz_data.build(datasets, {"sampler": "nuts"})
     messages = arviz_data.convergence_warnings(broken)
     row = arviz_data.summary(broken).loc["stuck"]
-    for value in (f"stuck ({row['r_hat']:.3f})", f"stuck ({row['ess_bulk']:.0f})", "3 of 400"):
+    for value in (f"stuck ({row['r_hat']:.4f})", f"stuck ({row['ess_bulk']:.0f})", "3 of 400"):
         assert any(value in message for message in messages), value
     assert not any("anchor" in message for message in messages)
     draws = rng.normal(size=(4, 1000))
