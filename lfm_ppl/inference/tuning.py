@@ -19,6 +19,7 @@ Source: García-Fernández, Svensson and Särkkä (2017), IEEE Transactions on S
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -158,8 +159,13 @@ def _log_likelihoods_at(bound: BoundModel, draws: np.ndarray,
         return jax.lax.map(log_likelihood, draws)
 
     run = bound.program(("log likelihoods after iterations", most_steps), lambda: Program(log_likelihoods))
-    return lambda iterations, steps: np.asarray(
-        run(jnp.asarray(draws), jnp.asarray(iterations), jnp.asarray(steps), bound.problem))
+
+
+    @functools.cache  # some numbers are asked for twice
+    def at_draws(iterations: int, steps: int) -> np.ndarray:
+        return np.asarray(run(jnp.asarray(draws), jnp.asarray(iterations), jnp.asarray(steps), bound.problem))
+
+    return at_draws
 
 
 def anchor_at_mode(key: jax.Array, bound: BoundModel, laplace: Laplace) -> tuple[BoundModel, dict[str, Tuning]]:

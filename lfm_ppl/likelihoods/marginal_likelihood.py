@@ -170,8 +170,8 @@ class MarginalLikelihood(SeriesLikelihood):
         grid = self.time_grid
         if most_steps is not None:
             # Where breakpoints divide an interval between two times, its parts have their share of the steps.
-            part, own = grid.steps, self.settings.integration_steps
-            grid = divide_intervals(grid, -(-part * steps // own), -(-part * most_steps // own))
+            part, whole = grid.steps, self.settings.integration_steps
+            grid = divide_intervals(grid, -(-part * steps // whole), -(-part * most_steps // whole))
         problem, updater = filter_problem(self.ssm, self.settings.rule, grid), GaussianUpdate(y)
         points = posterior_linearisation(problem, updater, iterations, self.settings.damping,
                                          self.about.on_grid(grid, most_steps is None)).points
