@@ -27,7 +27,7 @@ from lfm_ppl.constrained.gauss_newton import solve_nonlinear
 from lfm_ppl.constrained.interior_point import RESPECTED, ConstrainedProblem, Solution, solve_linear
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
 from lfm_ppl.filtering.moments import Moments
-from lfm_ppl.filtering.smoother import MeanSd
+from lfm_ppl.filtering.smoother import MeanSd, moments_by_name
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.model.latent_force_model import LatentForceModel
 from lfm_ppl.model.observation import GaussianObservation
@@ -85,18 +85,16 @@ class ConstrainedEstimate(eqx.Module):
         Raises:
             ValueError: an unknown name; the message lists similar names.
         """
-        return named_mean("state", name, self.state_names, self.state_mean)
+        return most_probable("state", name, self.state_names, self.state_mean)
 
     def force(self, name: str) -> MeanSd:
         """Return the trajectory (K,) of a force as ``mean``; its ``sd`` is NaN."""
-        return named_mean("force", name, self.force_names, self.force_mean)
+        return most_probable("force", name, self.force_names, self.force_mean)
 
 
-def named_mean(kind: str, name: str, names: tuple[str, ...], means: jax.Array) -> MeanSd:
+def most_probable(kind: str, name: str, names: tuple[str, ...], means: jax.Array) -> MeanSd:
     """Return the mean of a state or force by its name, from means (..., N) of all, with an sd of NaN."""
-    checks.one_of(kind, name, names)
-    mean = means[..., names.index(name)]
-    return MeanSd(mean, jnp.full_like(mean, jnp.nan))
+    return moments_by_name(kind, name, names, means, jnp.full_like(means, jnp.nan))
 
 
 def full_information(model: LatentForceModel, times: ArrayLike, y: ArrayLike,

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 
 from lfm_ppl.constrained.augmented import Rows, augmented_model
 from lfm_ppl.constrained.constraints import Constraints, build_constraints
-from lfm_ppl.constrained.full_information import ConstrainedEstimate, check_settings, named_mean, solve_problem
+from lfm_ppl.constrained.full_information import ConstrainedEstimate, check_settings, most_probable, solve_problem
 from lfm_ppl.constrained.gauss_newton import ConstrainedDynamics
 from lfm_ppl.constrained.interior_point import ConstrainedProblem
 from lfm_ppl.filtering.arguments import check_observations, warn_single_precision
@@ -95,11 +95,11 @@ class HorizonEstimate:
         Raises:
             ValueError: an unknown name; the message lists similar names.
         """
-        return named_mean("state", name, self.state_names, self.state_mean)
+        return most_probable("state", name, self.state_names, self.state_mean)
 
     def force(self, name: str) -> MeanSd:
         """Return a force at the time of the estimate as ``mean`` (); its ``sd`` is NaN."""
-        return named_mean("force", name, self.force_names, self.force_mean)
+        return most_probable("force", name, self.force_names, self.force_mean)
 
 
 class HorizonSettings(eqx.Module):

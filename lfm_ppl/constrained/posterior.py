@@ -36,7 +36,7 @@ from lfm_ppl.filtering.ep.settings import FactorSettings
 from lfm_ppl.filtering.forward import FilterTrace
 from lfm_ppl.filtering.moments import Record
 from lfm_ppl.filtering.problem import at_intervals
-from lfm_ppl.filtering.smoother import MeanSd, Trajectories
+from lfm_ppl.filtering.smoother import MeanSd, Trajectories, moments_by_name
 from lfm_ppl.filtering.time_grid import build_time_grid
 from lfm_ppl.linearisation.rule import Rule
 from lfm_ppl.model.latent_force_model import LatentForceModel
@@ -82,15 +82,11 @@ class ConstrainedPosterior(eqx.Module):
         Raises:
             ValueError: an unknown name; the message lists similar names.
         """
-        checks.one_of("state", name, self.state_names)
-        index = self.state_names.index(name)
-        return MeanSd(self.state_mean[:, index], self.state_sd[:, index])
+        return moments_by_name("state", name, self.state_names, self.state_mean, self.state_sd)
 
     def force(self, name: str) -> MeanSd:
         """Return mean (K,) and sd (K,) of a force."""
-        checks.one_of("force", name, self.force_names)
-        index = self.force_names.index(name)
-        return MeanSd(self.force_mean[:, index], self.force_sd[:, index])
+        return moments_by_name("force", name, self.force_names, self.force_mean, self.force_sd)
 
     def interval(self, name: str, level: float = 0.95) -> tuple[jax.Array, jax.Array]:
         """Return the ends (K,), (K,) of the central interval of a state or force.

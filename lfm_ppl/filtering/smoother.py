@@ -57,6 +57,39 @@ class MeanSd(NamedTuple):
     sd: jax.Array
 
 
+def moments_by_name(kind: str, name: str, names: tuple[str, ...], mean: jax.Array, sd: jax.Array) -> MeanSd:
+    """Return the moments of a force or a state, from those (..., N) of all in the order of their names.
+
+    Args:
+        kind: "force" or "state", for the message.
+        name: of the one that is asked for.
+        names: names of all N.
+        mean: (..., N).
+        sd: (..., N).
+
+    Raises:
+        ValueError: unknown name; the message has the nearest ones.
+    """
+    checks.one_of(kind, name, names)
+    index = names.index(name)
+    return MeanSd(mean[..., index], sd[..., index])
+
+
+def input_marginal(result: Any, kind: str, name: str) -> MeanSd:
+    """Return the moments of a force or a state of a result that has those of w = (x, u).
+
+    Args:
+        result: with ``input_mean`` (K, M + R), ``input_covariance`` (K, M + R, M + R), and names of states and forces.
+        kind: "force" or "state".
+        name: of the one that is asked for.
+    """
+    count = len(result.state_names)
+    names, columns = ((result.state_names, slice(count)) if kind == "state"
+                      else (result.force_names, slice(count, None)))
+    sd = safe_sqrt(jnp.diagonal(result.input_covariance, axis1=1, axis2=2))
+    return moments_by_name(kind, name, names, result.input_mean[:, columns], sd[:, columns])
+
+
 class Trajectories(NamedTuple):
     """Draws of whole trajectories at the requested times.
 
@@ -116,16 +149,11 @@ class SmootherResult(eqx.Module):
         Raises:
             ValueError: unknown name; the message has the nearest ones.
         """
-        return self._marginal("force", name, self.force_names, len(self.state_names))
+        return input_marginal(self, "force", name)
 
     def state(self, name: str) -> MeanSd:
         """Return mean (K,) and sd (K,) of a physical state."""
-        return self._marginal("state", name, self.state_names, 0)
-
-    def _marginal(self, kind: str, name: str, names: tuple[str, ...], first: int) -> MeanSd:
-        checks.one_of(kind, name, names)
-        index = first + names.index(name)
-        return MeanSd(self.input_mean[:, index], safe_sqrt(self.input_covariance[:, index, index]))
+        return input_marginal(self, "state", name)
 
     def sample(self, key: jax.Array, draws: int = 1) -> Trajectories:
         """Draw whole trajectories from the joint smoothing distribution, by `sample_errors`.

@@ -25,7 +25,7 @@ from lfm_ppl.filtering.breakdown import FilterWarning
 from lfm_ppl.filtering.intervals import TimeGrid, with_state_maps
 from lfm_ppl.filtering.moments import Moments
 from lfm_ppl.filtering.problem import filter_problem
-from lfm_ppl.filtering.smoother import MeanSd
+from lfm_ppl.filtering.smoother import MeanSd, input_marginal
 from lfm_ppl.filtering.stiffness import (
     ExplicitSteps,
     explicit_steps,
@@ -58,7 +58,6 @@ from lfm_ppl.switching.switched_model import SwitchedProblem, with_forces_of
 from lfm_ppl.switching.switched_simulation import simulate_paths
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.gradients import finite_or_minus_infinity
-from lfm_ppl.utils.linalg import safe_sqrt
 from lfm_ppl.utils.programs import Program
 from lfm_ppl.utils.random_keys import split_by_name
 
@@ -96,16 +95,11 @@ class RegimeSmootherResult(eqx.Module):
         Raises:
             ValueError: an unknown name; the message lists similar names.
         """
-        checks.one_of("state", name, self.state_names)
-        return self._marginal(self.state_names.index(name))
+        return input_marginal(self, "state", name)
 
     def force(self, name: str) -> MeanSd:
         """Return mean (K,) and sd (K,) of a force, over the regimes."""
-        checks.one_of("force", name, self.force_names)
-        return self._marginal(len(self.state_names) + self.force_names.index(name))
-
-    def _marginal(self, index: int) -> MeanSd:
-        return MeanSd(self.input_mean[:, index], safe_sqrt(self.input_covariance[:, index, index]))
+        return input_marginal(self, "force", name)
 
 
 class Switching(SeriesLikelihood):
