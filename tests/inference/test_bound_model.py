@@ -22,9 +22,9 @@ from lfm_ppl.inference import sampling
 from lfm_ppl.inference.bind import bind_arguments
 from lfm_ppl.inference.bound_samplers import nuts_sampler, ram_sampler
 from lfm_ppl.inference.laplace_start import Laplace
-from lfm_ppl.inference.skew_coordinates import SkewCoordinates
 from lfm_ppl.inference.model_digest import model_digest
 from lfm_ppl.inference.schedule import Schedule
+from lfm_ppl.inference.skew_coordinates import SkewCoordinates
 from lfm_ppl.inference.unbound_model import SharedModel
 from lfm_ppl.results.result_view import ResultView
 from tests.compiled_programs import compilations
