@@ -34,6 +34,7 @@ from lfm_ppl.inference.kernels.options import KERNELS
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.laplace_start import (
+    NEGLIGIBLE_RISE,
     Laplace,
     UnusableModeError,
     has_second_mode,
@@ -220,7 +221,7 @@ def _find_mode(bound: BoundModel, options: FitOptions) -> MAPResult:
         return mode_of(options.keys["mode"], bound)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return mode_of(options.keys["mode"], bound, restarts=2)
+        return mode_of(options.keys["mode"], bound, restarts=2, negligible_rise=NEGLIGIBLE_RISE)
 
 
 def _strategy(options: FitOptions, mode: MAPResult | None = None) -> Callable:

@@ -19,6 +19,7 @@ from lfm_ppl.inference.laplace_start import (
     laplace_approximation,
     starting_points,
 )
+from lfm_ppl.inference.map import mode_of
 from lfm_ppl.inference.skew_coordinates import SkewCoordinates
 
 COVARIANCE = np.array([[1.0, 0.9], [0.9, 2.0]])
@@ -51,6 +52,19 @@ def many():
 def test_a_mode_that_does_not_describe_the_posterior_is_refused(model, name):
     with pytest.raises(UnusableModeError, match=name):
         laplace_approximation(jax.random.key(0), bound(model))
+
+
+def stairs():
+    """Return a density with small jumps that its gradient does not show, as with adaptive integration steps."""
+    x = numpyro.sample("x", dist.ImproperUniform(dist.constraints.real, (), ()))
+    numpyro.factor("likelihood", 400.0 * (x - jnp.exp(x)) - 1e-6 * jnp.floor(1e5 * x))
+
+
+def test_small_jumps_of_the_density_do_not_make_the_mode_unusable():
+    assert "still rises" in mode_of(jax.random.key(0), bound(stairs)).message
+    laplace = laplace_approximation(jax.random.key(0), bound(stairs))
+    assert_allclose(laplace.mode, 0.0, atol=1e-3)
+    assert_allclose(laplace.covariance, 1.0 / 400.0, rtol=1e-3)
 
 
 DIRECTIONS = {
