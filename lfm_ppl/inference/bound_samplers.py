@@ -16,9 +16,9 @@ from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, particle_marginal
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.kernels.robust_metropolis import robust_metropolis
-from lfm_ppl.inference.laplace_start import Laplace
 from lfm_ppl.inference.nuts import NUTSState, nuts, nuts_options
 from lfm_ppl.inference.problem import Problem, signature
+from lfm_ppl.inference.skew_coordinates import SkewCoordinates
 
 _SLOW_WARMUP_HINT = (
     "this warm-up is slow, and the time left may still grow. From the posterior mode, with the covariance "
@@ -55,17 +55,17 @@ class BoundSampler:
 
 
 def nuts_sampler(bound: BoundModel, num_warmup: int, options: Mapping[str, Any],
-                 laplace: Laplace | None = None) -> BoundSampler:
+                 coordinates: SkewCoordinates | None = None) -> BoundSampler:
     """Return NumPyro's NUTS.
 
     Args:
         bound: the model and its data.
         num_warmup: warm-up steps of each chain.
         options: arguments of NUTS.
-        laplace: approximation of the posterior. Its covariance is the initial inverse mass matrix, which is dense, and
-            regularises the estimates of the warm-up. None: the warm-up starts with the identity.
+        coordinates: of the chains. Their covariance is the initial inverse mass matrix, which is dense, and regularises
+            the estimates of the warm-up. None: the unconstrained parameters, and the warm-up starts with the identity.
     """
-    completed = nuts_options(bound, options, laplace)
+    completed = nuts_options(bound, options, coordinates is not None)
     gradient = bound.gradient(bool(completed["forward_mode_differentiation"]))
 
     def evaluate(z: Any) -> tuple[jax.Array, jax.Array]:
@@ -74,11 +74,11 @@ def nuts_sampler(bound: BoundModel, num_warmup: int, options: Mapping[str, Any],
     def describe(state: NUTSState) -> str:
         return _step_size_and_acceptance(state.hmc.adapt_state.step_size, state.hmc.mean_accept_prob)
 
-    has_default_mass = laplace is None and "inverse_mass_matrix" not in options
+    has_default_mass = coordinates is None and "inverse_mass_matrix" not in options
     return BoundSampler(
         bound, nuts(bound, num_warmup, completed),
-        ("nuts", num_warmup, laplace is not None, signature(completed) or object()), evaluate,
-        jax.tree_util.tree_map(jnp.asarray, laplace), describe, bound.problem,
+        ("nuts", num_warmup, coordinates is not None, signature(completed) or object()), evaluate,
+        jax.tree_util.tree_map(jnp.asarray, coordinates), describe, bound.problem,
         _SLOW_WARMUP_HINT if has_default_mass else "")
 
 

@@ -36,6 +36,9 @@ _SIMILAR_HEIGHT = 5.0
 _SEPARATION = 3.0
 """Distance in standard deviations from which two ends of the search are two modes."""
 
+NEGLIGIBLE_RISE = 1e-3
+"""Rise of the log density within one step that the search may leave: 0.04 standard deviations."""
+
 _PULLS = 6
 """Number of halvings of the distance of a starting point to the mode, before the mode itself is the start."""
 
@@ -73,7 +76,7 @@ def laplace_approximation(key: jax.Array, bound: BoundModel) -> Laplace:
     with warnings.catch_warnings():
         # The same conditions raise below, with a remedy that fits here.
         warnings.simplefilter("ignore")
-        result = mode_of(key, bound)
+        result = mode_of(key, bound, negligible_rise=NEGLIGIBLE_RISE)
     if not np.all(np.isfinite(result.covariance)):
         raise UnusableModeError("the Hessian at the posterior mode is not finite")
     if not result.converged:

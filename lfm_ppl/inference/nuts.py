@@ -2,7 +2,9 @@
 
 1. The potential energy and its gradient come from the compiled program of the bound model, in the derivative mode that
    is faster there.
-2. With a Laplace approximation N(mode, C), the warm-up starts with C as the dense inverse mass matrix.
+2. With a Laplace approximation, the chain moves in coordinates without the skewness of the posterior
+   (`lfm_ppl.inference.skew_coordinates`), and the warm-up starts with the covariance C of the approximation as the
+   dense inverse mass matrix.
 3. NumPyro estimates the covariance anew in each window of the warm-up. Each estimate starts with `_PSEUDO_DRAWS` draws
    of the approximation, so that the inverse mass matrix is (n S + n_0 C) / (n + n_0) for the covariance S of n draws.
 
@@ -24,7 +26,7 @@ from numpyro.infer.util import ParamInfo
 
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.inference.kernels.algorithm import SamplingAlgorithm
-from lfm_ppl.inference.laplace_start import Laplace
+from lfm_ppl.inference.skew_coordinates import SkewCoordinates
 
 _DENSE_MASS_LIMIT = 10
 """Largest number of unconstrained parameters with a dense mass matrix by default."""
@@ -41,27 +43,36 @@ class NUTSState(NamedTuple):
     """State of a NUTS chain.
 
     Attributes:
-        hmc: NumPyro's state.
-        laplace: the Laplace approximation that regularises the mass matrix, constant in time; or None.
+        hmc: NumPyro's state; its position are the coordinates, or the unconstrained parameters themselves.
+        coordinates: of the chain, constant in time; their covariance regularises the mass matrix. None: the
+            unconstrained parameters.
     """
 
     hmc: HMCState
-    laplace: Laplace | None
+    coordinates: SkewCoordinates | None
 
     @property
-    def z(self) -> Any:
-        """Unconstrained parameters by site."""
-        return self.hmc.z
+    def z(self) -> jax.Array:
+        """Unconstrained parameters (d,)."""
+        position = ravel_pytree(self.hmc.z)[0]
+        return position if self.coordinates is None else self.coordinates.to_z(position)
+
+    @property
+    def potential(self) -> jax.Array:
+        """Minus the log density of the unconstrained parameters."""
+        if self.coordinates is None:
+            return self.hmc.potential_energy
+        return self.hmc.potential_energy + _log_slope(self.coordinates, ravel_pytree(self.hmc.z)[0])
 
 
-def nuts_options(bound: BoundModel, options: Mapping[str, Any], laplace: Laplace | None) -> dict[str, Any]:
+def nuts_options(bound: BoundModel, options: Mapping[str, Any], has_laplace: bool) -> dict[str, Any]:
     """Return the options of NUTS with defaults.
 
     A dense mass matrix is the default for up to ten parameters, with a Laplace approximation for any number.
     """
     completed = {"forward_mode_differentiation": bound.forward_mode,
-                 "dense_mass": laplace is not None or bound.size <= _DENSE_MASS_LIMIT,
-                 "target_accept_prob": _ACCEPTANCE if laplace is None else _ACCEPTANCE_AT_MODE, **options}
+                 "dense_mass": has_laplace or bound.size <= _DENSE_MASS_LIMIT,
+                 "target_accept_prob": _ACCEPTANCE_AT_MODE if has_laplace else _ACCEPTANCE, **options}
     if isinstance(completed["dense_mass"], bool):
         # Blocks of named sites, the form that NUTS itself uses for a model.
         completed["dense_mass"] = [tuple(sorted(bound.sites))] if completed["dense_mass"] else []
@@ -69,7 +80,7 @@ def nuts_options(bound: BoundModel, options: Mapping[str, Any], laplace: Laplace
 
 
 def nuts(bound: BoundModel, num_warmup: int, options: Mapping[str, Any]) -> SamplingAlgorithm:
-    """Return NumPyro's NUTS; its tuning is a Laplace approximation or None.
+    """Return NumPyro's NUTS; its tuning are `SkewCoordinates` or None.
 
     Args:
         bound: the model.
@@ -79,7 +90,7 @@ def nuts(bound: BoundModel, num_warmup: int, options: Mapping[str, Any]) -> Samp
     options = dict(options)
     log_density_gradient = bound.gradient(bool(options.pop("forward_mode_differentiation")))
 
-    def kernel_at(y: Any, **mass_matrix: Any) -> NUTS:
+    def kernel_at(y: Any, coordinates: SkewCoordinates | None, **mass_matrix: Any) -> NUTS:
         # NumPyro differentiates the potential in reverse mode. A custom derivative gives it the gradient of the traced
         # program, which is in forward mode for few parameters and is compiled once for all chains and blocks.
         @jax.custom_jvp
@@ -91,41 +102,63 @@ def nuts(bound: BoundModel, num_warmup: int, options: Mapping[str, Any]) -> Samp
             value, gradient = log_density_gradient(primals[0], y)
             return value, gradient @ tangents[0]
 
-        return NUTS(potential_fn=lambda z: -log_density(ravel_pytree(z)[0]), **options, **mass_matrix)
+        def potential(position: Any) -> jax.Array:
+            x = ravel_pytree(position)[0]
+            if coordinates is None:
+                return -log_density(x)
+            return -log_density(coordinates.to_z(x)) - _log_slope(coordinates, x)
 
-    def init(key: jax.Array, point: ParamInfo, y: Any, laplace: Laplace | None) -> NUTSState:
-        mass_matrix = {} if laplace is None else {"inverse_mass_matrix": laplace.covariance}
-        hmc = kernel_at(y, **mass_matrix).init(key, num_warmup, point, (), {})
-        return NUTSState(_with_pseudo_draws(hmc, laplace), laplace)
+        return NUTS(potential_fn=potential, **options, **mass_matrix)
+
+    def init(key: jax.Array, point: ParamInfo, y: Any, coordinates: SkewCoordinates | None) -> NUTSState:
+        mass_matrix = {}
+        if coordinates is not None:
+            point, mass_matrix = _in_coordinates(point, coordinates), {"inverse_mass_matrix": coordinates.covariance}
+        hmc = kernel_at(y, coordinates, **mass_matrix).init(key, num_warmup, point, (), {})
+        return NUTSState(_with_pseudo_draws(hmc, coordinates), coordinates)
 
     def step(state: NUTSState, y: Any) -> NUTSState:
-        kernel, hmc = kernel_at(y), state.hmc
+        hmc, coordinates = state
+        kernel = kernel_at(y, coordinates)
         # `init` builds the functions of the kernel. Its state is not used, and the compiler removes it.
         kernel.init(jax.random.key(0), num_warmup, ParamInfo(hmc.z, hmc.potential_energy, hmc.z_grad), (), {})
-        return NUTSState(_with_pseudo_draws(kernel.sample(hmc, (), {}), state.laplace), state.laplace)
+        return NUTSState(_with_pseudo_draws(kernel.sample(hmc, (), {}), coordinates), coordinates)
 
     return SamplingAlgorithm(init, step, _summary)
 
 
+def _log_slope(coordinates: SkewCoordinates, x: jax.Array) -> jax.Array:
+    return jnp.log(coordinates.slope(x)).sum()
+
+
+def _in_coordinates(point: ParamInfo, coordinates: SkewCoordinates) -> ParamInfo:
+    """Return a point, its potential energy and the gradient in other coordinates."""
+    z, unravel = ravel_pytree(point.z)
+    x = coordinates.to_x(z)
+    log_slope, gradient = jax.value_and_grad(lambda x: _log_slope(coordinates, x))(x)
+    slope = ravel_pytree(point.z_grad)[0] * coordinates.slope(x) - gradient
+    return ParamInfo(unravel(x), point.potential_energy - log_slope, unravel(slope))
+
+
 def _summary(state: NUTSState) -> dict[str, jax.Array]:
     hmc = state.hmc
-    return {"z": ravel_pytree(hmc.z)[0], "diverging": hmc.diverging, "acceptance_rate": hmc.accept_prob,
+    return {"z": state.z, "diverging": hmc.diverging, "acceptance_rate": hmc.accept_prob,
             "n_steps": hmc.num_steps, "energy": hmc.energy, "step_size": hmc.adapt_state.step_size,
-            "lp": hmc.potential_energy}
+            "lp": state.potential}
 
 
-def _with_pseudo_draws(hmc: HMCState, laplace: Laplace | None) -> HMCState:
+def _with_pseudo_draws(hmc: HMCState, coordinates: SkewCoordinates | None) -> HMCState:
     """Return the state with `_PSEUDO_DRAWS` draws of the approximation in every empty covariance estimate.
 
     A window of the warm-up may have few draws for d parameters. Welford's algorithm continues from the mean, the sum of
     squares and the count of the pseudo-draws.
     """
-    if laplace is None:
+    if coordinates is None:
         return hmc
     adaptation = hmc.adapt_state
     (sites, (mean, sum_of_squares, count)), = adaptation.mm_state.items()  # one dense block of all sites
     is_empty = count == 0
-    estimate = (jnp.where(is_empty, laplace.mode, mean),
-                jnp.where(is_empty, _PSEUDO_DRAWS * laplace.covariance, sum_of_squares),
+    estimate = (jnp.where(is_empty, 0.0, mean),
+                jnp.where(is_empty, _PSEUDO_DRAWS * coordinates.covariance, sum_of_squares),
                 jnp.where(is_empty, _PSEUDO_DRAWS, count))
     return hmc._replace(adapt_state=adaptation._replace(mm_state={sites: estimate}))

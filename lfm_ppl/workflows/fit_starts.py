@@ -1,7 +1,8 @@
 """The starting points of the chains of `lfm_ppl.fit`, and the sampler that moves them.
 
-1. NUTS starts at draws from the widened Laplace approximation, whose covariance is its first inverse mass matrix. Where
-   the approximation is not usable, it starts at the prior median with a unit mass matrix.
+1. NUTS starts at draws from the widened Laplace approximation, whose covariance is its first inverse mass matrix, in
+   coordinates without skewness (`lfm_ppl.inference.skew_coordinates`). Where the approximation is not usable, it starts
+   at the prior median with a unit mass matrix.
 2. A random walk needs no gradient, but to learn the shape of the posterior by rejection takes thousands of steps. Its
    first proposal covariance is that of the Laplace approximation, and its chains start at draws from it.
 3. Particle-marginal RAM also chooses the number of particles, by default at the mode.
@@ -33,6 +34,7 @@ from lfm_ppl.inference.kernels.options import KERNELS
 from lfm_ppl.inference.kernels.particle_marginal import ParticleMarginalRAM, Tuned
 from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.laplace_start import (
+    NEGLIGIBLE_RISE,
     Laplace,
     UnusableModeError,
     has_second_mode,
@@ -41,6 +43,7 @@ from lfm_ppl.inference.laplace_start import (
 )
 from lfm_ppl.inference.long_steps import stiff_sites, with_exponential_steps
 from lfm_ppl.inference.map import MAPResult, mode_of
+from lfm_ppl.inference.skew_coordinates import SkewCoordinates, skew_coordinates
 from lfm_ppl.inference.tuning import ANCHOR, Tuning, anchor_at_mode, anchor_attribute, anchored
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.interruption import was_interrupt
@@ -107,14 +110,15 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
     # The Laplace approximation does not regularise a mass matrix of the user.
     is_regularized = "inverse_mass_matrix" not in sampler_options and sampler_options.get("dense_mass", True) is True
 
-    def sampler(bound: BoundModel, laplace: Laplace | None, warmup: int) -> BoundSampler:
+    def sampler(bound: BoundModel, coordinates: SkewCoordinates | None, warmup: int) -> BoundSampler:
         num_warmup = warmup * (options.thin or 1)
-        return nuts_sampler(bound, num_warmup, sampler_options, laplace if is_regularized else None)
+        return nuts_sampler(bound, num_warmup, sampler_options, coordinates if is_regularized else None)
 
     if setup is not None:
         bound = with_exponential_steps(bound, json.loads(setup.get(EXPONENTIAL, "[]")))
-        # The stored state holds the approximation; the program needs its shapes only.
-        shapes = Laplace(np.zeros(bound.size), np.eye(bound.size)) if setup["init"] == "laplace" else None
+        # The stored state holds the coordinates; the program needs their shapes only.
+        zeros = np.zeros(bound.size)
+        shapes = SkewCoordinates(Laplace(zeros, np.eye(bound.size)), zeros) if setup["init"] == "laplace" else None
         return ChainStart(sampler(anchored(bound, setup), shapes, setup["warmup"]), None, dict(setup))
     laplace, fallback, stiff = None, {}, []
     is_at_mode = options.init in (None, "map")
@@ -132,7 +136,7 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
     tunings: dict[str, Tuning] = {}
     if laplace is not None:
         bound, tunings = anchor_at_mode(options.keys["tuning"], bound, laplace)
-    nuts = sampler(bound, laplace, warmup)
+    nuts = sampler(bound, None if laplace is None else skew_coordinates(bound, laplace), warmup)
     if is_at_mode:  # the advice for a slow warm-up is to start there
         nuts = dataclasses.replace(nuts, slow_warmup_hint="")
     if laplace is not None:
@@ -217,7 +221,7 @@ def _find_mode(bound: BoundModel, options: FitOptions) -> MAPResult:
         return mode_of(options.keys["mode"], bound)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return mode_of(options.keys["mode"], bound, restarts=2)
+        return mode_of(options.keys["mode"], bound, restarts=2, negligible_rise=NEGLIGIBLE_RISE)
 
 
 def _strategy(options: FitOptions, mode: MAPResult | None = None) -> Callable:
