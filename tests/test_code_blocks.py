@@ -114,7 +114,7 @@ def test_python_blocks_use_names_and_arguments_of_the_library(name):
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", [
     pytest.param(name, marks=[pytest.mark.slow] if name in COSTLY else []) for name in WITH_PYTHON])
-def test_python_blocks_of_a_page_run_in_order(name, few_draws, page_folder):
+def test_python_blocks_of_a_page_run_in_order(name, few_draws, page_folder, release_programs_of_test):
     names = {"__name__": f"page_{name}"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lfm.ConvergenceWarning)  # of ten draws

@@ -1,4 +1,4 @@
-"""Every shipped model converges on its own data with the default settings, and some by a random walk."""
+"""Every shipped model converges on its own data with the default settings, and one by a random walk."""
 
 import warnings
 
@@ -9,9 +9,9 @@ import lfm_ppl as lfm
 from lfm_ppl.io import loading
 from lfm_ppl.results.arviz_data import summary
 from lfm_ppl.results.result_view import ResultView
+from tests.arviz_checks import check_arviz
 
-RANDOM_WALKS = [(name, {"sampler": "ram", "warmup": 1000, "samples": 1000})
-                for name in ("ginzburg-landau", "transcription", "spring")]
+RANDOM_WALKS = [("spring", {"sampler": "ram", "warmup": 1000, "samples": 1000})]
 
 
 @pytest.mark.slow
@@ -30,6 +30,7 @@ def test_chains_converge_and_cover_the_truth(name, options):
     assert "sampler" in options or not view.group("sample_stats")["diverging"].any()
     for name in {"log_likelihood", "posterior_predictive", "trajectories"} & set(view.groups):
         assert all(np.isfinite(variable).all() for variable in view.group(name).data_vars.values()), name
+    check_arviz(result, {"y": int(np.isfinite(data.y).sum())})
     posterior, truth = view.posterior, view.group("truth")
     ranks = []
     for parameter in [name for name in file.parameters if name in posterior]:  # some are of another option
