@@ -189,8 +189,7 @@ def widening(x, u, t):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("y", [[1.2, 3.0], [np.nan, 3.0], [1.2, np.nan]])
-@pytest.mark.parametrize("angular", [(), (1,)])
+@pytest.mark.parametrize(("angular", "y"), [((), [1.2, np.nan]), ((1,), [1.2, 3.0]), ((1,), [np.nan, 3.0])])
 def test_likelihood_of_several_outputs_against_quadrature(y, angular):
     y = np.array(y)
     model = lfm.LatentForceModel(zero_drift, {}, lfm.GaussianObservation(state_and_angle, widening, angular),
