@@ -48,13 +48,13 @@ def _asked_for(config: pytest.Config, mark: str) -> bool:
 def pytest_configure(config: pytest.Config) -> None:
     """Compile faster, before a backend exists, except where speed is measured.
 
-    Without optimisations tests take two thirds of the time, since they compile more than they compute. Slow ones do
-    both, for which level 1 takes least: its programs run about as fast as those that are optimised in full.
+    Without optimisations tests take two thirds of the time, since they compile more than they compute (but for slow
+    ones, whose programs are optimised in full).
     """
     if _asked_for(config, "performance"):
         return
     _keep_to_one_cpu(os.environ.get("PYTEST_XDIST_WORKER", ""))
-    quick_compilation(1 if _asked_for(config, "slow") else 0)
+    quick_compilation(3 if _asked_for(config, "slow") else 0)
 
 
 @pytest.hookimpl(tryfirst=True)

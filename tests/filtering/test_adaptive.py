@@ -109,16 +109,15 @@ def explicit(input_=None, tolerance=None, steps=2000, force=None, initial_time=0
     return lfm.MarginalLikelihood(model, TIMES, steps=steps, iterations=0, tolerance=tolerance)
 
 
-STEPPED = lfm.Input(jnp.array([0.0, 2.0, 4.0, 6.0]), jnp.array([1.0, -2.0, 3.0, -1.0]))
 WITHIN = lfm.Input(jnp.array([0.0, 1.3, 4.7]), jnp.array([1.0, -2.0, 3.0]))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("keywords", [
-    {}, {"input_": STEPPED}, {"input_": WITHIN}, {"force": lfm.Matern(1.0, 2.0, mean=lambda t: jnp.cos(t))},
+    {"input_": WITHIN}, {"force": lfm.Matern(1.0, 2.0, mean=lambda t: jnp.cos(t))},
     {"force": systems.Kicked(0.3, (3.0, 5.0), 1.0, 2.0)},
     {"dispersion": lambda x, u, t: (1.0 + 0.2 * jnp.sin(t) + 0.1 * jnp.tanh(x))[:, None]},
-], ids=["time", "input", "input within rows", "mean function", "jumps", "state-dependent noise"])
+], ids=["input within rows", "mean function", "jumps", "state-dependent noise"])
 def test_dynamics_that_depend_on_time(keywords):
     exact, adaptive = jax.jit(lambda y: (explicit(**keywords).log_prob(y), explicit(
         **keywords, tolerance=1e-6, steps=400).log_prob(y)))(Y)

@@ -91,8 +91,8 @@ def inflated(times, y=None):
 FAMILIES = {"Poisson": poisson, "Poisson, softplus": softplus_poisson, "negative binomial": negative_binomial,
             "Bernoulli": bernoulli, "binomial": binomial, "Student-t": student_t, "censored": censored,
             "zero-inflated": inflated}
-FILES = {"coal": {}, "epidemic": {}, "transcription": {"df": 4.0}, "ballistic": {"df": 4.0}, "ginzburg-landau": {},
-         "spring": {}, "transcription exponential": {"link": "exponential"}}
+FILES = {"epidemic": {}, "transcription": {"df": 4.0}, "ginzburg-landau": {},
+         "transcription exponential": {"link": "exponential"}}
 # Explicit integration with the model's own 60 steps is unstable in the stiffest wells.
 MOST_FAILURES = {"ginzburg-landau": 0.05}
 
@@ -160,7 +160,7 @@ def assert_nearly_all_have_a_density(name, z, run):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name, count", [("Student-t", 25), *(pytest.param(name, 1_000, marks=pytest.mark.slow)
-                                                              for name in FAMILIES)])
+                                                              for name in FAMILIES if name != "Student-t")])
 def test_draws_of_the_prior_have_a_density_and_a_gradient(name, count):
     assert_nearly_all_have_a_density(name, *densities(FAMILIES[name], TIMES, data(name), count))
 
