@@ -50,37 +50,6 @@ def test_slow_and_stiff_models_are_integrated_to_the_tolerance():
 
 
 @pytest.mark.slow
-def test_a_model_that_is_not_linear_in_its_force_only_is_integrated_to_the_tolerance():
-    """With a fast and a slow state; gradients in both modes."""
-    y, theta = np.array([[0.2, 0.4], [0.9, 1.0], [np.nan, 1.3], [0.8, 0.9], [0.7, np.nan]]), jnp.array([8.0, 8.0, 0.6])
-
-    def log_prob(parameters, tolerance, steps):
-        return expression(parameters, tolerance, steps, link=lambda u: jax.nn.sigmoid(3.0 * u)).log_prob(y)
-
-    exact, gradient = jax.jit(jax.value_and_grad(lambda p: log_prob(p, None, 400)))(theta)
-    (loose, tight), reverse, forward = jax.jit(lambda p: (
-        (log_prob(p, 1e-1, 100), log_prob(p, 1e-5, 100)), jax.grad(log_prob)(p, 1e-5, 100),
-        jax.jacfwd(log_prob)(p, 1e-5, 100)))(theta)
-    assert abs(tight - exact) < 1e-2
-    assert abs(tight - exact) < abs(loose - exact)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
-    np.testing.assert_allclose(reverse, gradient, rtol=1e-2)
-
-
-@pytest.mark.thorough
-def test_gradients_are_those_of_the_exact_integration_in_both_modes():
-    theta = SLOW_TO_STIFF[0]
-
-    def adaptive(p):
-        return double_well(p, lfm.Taylor(), tolerance=1e-5).log_prob(Y)
-
-    exact = jax.jit(jax.jacfwd(lambda p: double_well(p, lfm.Taylor(), steps=400).log_prob(Y)))(theta)
-    reverse, forward = jax.jit(lambda p: (jax.grad(adaptive)(p), jax.jacfwd(adaptive)(p)))(theta)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-10)
-    np.testing.assert_allclose(reverse, exact, rtol=1e-4)
-
-
-@pytest.mark.slow
 def test_a_rejected_step_does_not_spoil_the_derivative():
     """A first step of an eighth of the interval would overflow."""
     theta = jnp.array([-3.0, 40.0, 5.0])
@@ -161,16 +130,6 @@ def test_replicates_gaps_and_a_row_of_its_own_for_each_call():
     first = lfm.filter(expression().model, TIMES[:3], y[:3], tolerance=1e-4, steps=60)
     second = lfm.filter(expression().model, TIMES[3:], y[3:], tolerance=1e-4, steps=60, start=first.state)
     np.testing.assert_allclose(second.log_likelihood, full_result.log_likelihood[3:], rtol=1e-10)
-
-
-@pytest.mark.slow
-def test_a_linear_model_has_its_exact_transition():
-    model = lfm.LatentForceModel(
-        systems.Linear(jnp.array([[-0.5]]), jnp.array([[1.0]])), {"u": lfm.Matern(1.0, 1.0)},
-        lfm.GaussianObservation(systems.whole_state, 0.01 * jnp.ones(1)), lfm.Gaussian([0.0], [1.0]))
-    exact, adaptive = jax.jit(lambda y: (lfm.MarginalLikelihood(model, TIMES).log_prob(y), lfm.MarginalLikelihood(
-        model, TIMES, tolerance=1e-1).log_prob(y)))(Y)
-    assert adaptive == exact
 
 
 @pytest.mark.slow

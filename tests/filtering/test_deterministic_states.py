@@ -203,11 +203,9 @@ def law_of_all(theta, f, y):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("factors", [None, pytest.param("variational", marks=pytest.mark.slow),
-                                     pytest.param("laplace", marks=pytest.mark.slow)])
-def test_all_families_add_their_densities(factors):
+def test_all_families_add_their_densities():
     def log_prob(theta):
-        return lfm.MarginalLikelihood(decay(theta, all_families(theta)), TIMES, factors=factors).log_prob(ALL)
+        return lfm.MarginalLikelihood(decay(theta, all_families(theta)), TIMES).log_prob(ALL)
 
     assert without_warnings(lambda: float(log_prob(THETA))) == pytest.approx(float(exact_rows(THETA).sum()), rel=1e-12)
     gradient = jax.jit(jax.grad(log_prob))(THETA)

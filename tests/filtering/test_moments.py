@@ -134,8 +134,7 @@ class TimeVarying(eqx.Module):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rule", [lfm.Taylor(), lfm.Cubature(), lfm.Cubature(full_state=True)],
-                         ids=lambda rule: rule.name)
+@pytest.mark.parametrize("rule", [lfm.Taylor(), lfm.Cubature(full_state=True)], ids=lambda rule: rule.name)
 def test_linear_with_coefficients_that_depend_on_time(rule):
     lam = 1.0 / 0.7
 

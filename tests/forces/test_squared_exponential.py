@@ -239,11 +239,10 @@ def test_posterior_of_the_force_is_that_of_the_exact_process():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("order", "bound", "driven"), [(DEFAULT, 0.03, True), (8, 0.004, False)])
-def test_log_likelihoods_of_100_data_sets(order, bound, driven):
+def test_log_likelihoods_of_12_data_sets():
     rng = np.random.default_rng(8)
     worst = 0.0
-    for index in range(100):
-        ell, sd, times, y, exact = draw(rng, (20, 60, 200)[index % 3], driven)
-        worst = max(worst, abs(of_filter(ell, sd, times, y, order, driven, 1.0) - exact.log_likelihood(times, y)))
-    assert worst < bound, worst
+    for index in range(12):
+        ell, sd, times, y, exact = draw(rng, (20, 60, 200)[index % 3], True)
+        worst = max(worst, abs(of_filter(ell, sd, times, y, DEFAULT, True, 1.0) - exact.log_likelihood(times, y)))
+    assert worst < 0.03, worst
