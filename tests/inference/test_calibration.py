@@ -47,8 +47,8 @@ def assert_uniform(name, result, bins):
 @pytest.mark.parametrize(("sampler", "model"), [("nuts", softplus), ("ram", motif)], ids=["nuts", "ram"])
 def test_samplers_are_calibrated(sampler, model):
     settings = {
-        "nuts": {"kernel": lambda m: NUTS(m, forward_mode_differentiation=True), "thin": 3, "warmup": 300, "batch": 20},
+        "nuts": {"kernel": lambda m: NUTS(m, forward_mode_differentiation=True), "thin": 3, "warmup": 150, "batch": 20},
         "ram": {"kernel": lfm.RAM, "thin": 60, "warmup": 2000},
     }[sampler]
-    result = calibration.calibrate(jax.random.key(12), model, TIMES, data_sets=120, **settings)
+    result = calibration.calibrate(jax.random.key(12), model, TIMES, data_sets=80, draws=31, **settings)
     assert_uniform(f"{sampler}_{model.__name__}", result, bins=8)
