@@ -212,7 +212,7 @@ def test_noise_of_rows_and_a_missing_keyword_are_named():
                          model_kwargs=keywords, at=[5.0])
     for model_kwargs, error, message in ((None, TypeError, r"needs variances: pass model_kwargs=\{'variances': ...\}"),
                                          (keywords, ValueError, "differs between rows"),
-                                         ({"variances": np.ones((2, 1, 1))}, ValueError, "2 matrices.* 4 times")):
+                                         ({"variances": np.ones((2, 1, 1))}, ValueError, "2 rows.* 4 times")):
         with pytest.raises(error, match=message):
             lfm.forecast(result, model, [5.0], model_kwargs=model_kwargs, progress=False)
 
