@@ -329,14 +329,14 @@ def test_bands_cover_new_data_over_40_runs():
     """Parameters, force, state and data from the prior; fit to 25 rows, predict the 10 after them."""
     times, data_rows, runs = np.linspace(0.0, 14.0, 35), 25, 40
     prior = numpyro.infer.Predictive(softplus_motif, num_samples=runs)(jax.random.key(1), times)["y"]
+    past = np.where(np.arange(35)[:, None] < data_rows, prior, np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lfm.ConvergenceWarning)
+        fits = list(lfm.fit_many(softplus_motif, {str(run): (times, past[run]) for run in range(runs)}, sampler="nuts",
+                                 chains=1, warmup=200, samples=400, trajectory_draws=400, at=times, progress=False))
     covered, pit = [], []
-    for index, y in enumerate(np.asarray(prior)):
-        past = np.where(np.arange(35)[:, None] < data_rows, y, np.nan)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", lfm.ConvergenceWarning)
-            result = lfm.fit(softplus_motif, times, past, sampler="nuts", chains=1, warmup=200, samples=400,
-                             trajectory_draws=400, at=times, seed=index, progress=False)
-        computed = predictions(result).isel(time=slice(data_rows, None))
+    for y, fitted in zip(np.asarray(prior), fits, strict=True):
+        computed = predictions(fitted.result).isel(time=slice(data_rows, None))
         mean, sd = (computed[name].values.reshape(-1, 10) for name in ("y_mean", "y_sd"))
         share = stats.norm.cdf((y[data_rows:, 0] - mean) / sd).mean(axis=0)
         pit.append(share)
