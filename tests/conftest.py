@@ -92,6 +92,17 @@ def release_compiled_programs():
     that is free, but still the process's, is given back first: it would look like programs for ever.
     """
     yield
+    _release_programs_where_crowded()
+
+
+@pytest.fixture
+def release_programs_of_test():
+    """Forget compiled programs after a single test where they have become many: some tests make thousands."""
+    yield
+    _release_programs_where_crowded()
+
+
+def _release_programs_where_crowded() -> None:
     if _crowded():
         _give_back_free_memory()
         if _crowded():

@@ -16,6 +16,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import jax
 import matplotlib.pyplot as plt
 import numpyro.infer
 import pytest
@@ -80,6 +81,14 @@ def few_draws(monkeypatch):
 
 
 @pytest.fixture
+def quick_programs():
+    """Compile with little effort: for few draws that is most of the time."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture
 def page_folder(tmp_path, monkeypatch):
     """Work in a folder with the files of docs/examples, from which a page imports."""
     shutil.copytree(DOCS / "examples", tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
@@ -114,7 +123,8 @@ def test_python_blocks_use_names_and_arguments_of_the_library(name):
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", [
     pytest.param(name, marks=[pytest.mark.slow] if name in COSTLY else []) for name in WITH_PYTHON])
-def test_python_blocks_of_a_page_run_in_order(name, few_draws, page_folder):
+@pytest.mark.usefixtures("few_draws", "quick_programs", "page_folder", "release_programs_of_test")
+def test_python_blocks_of_a_page_run_in_order(name):
     names = {"__name__": f"page_{name}"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lfm.ConvergenceWarning)  # of ten draws

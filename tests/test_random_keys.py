@@ -63,9 +63,7 @@ COMPUTATIONS = {
 }
 SLOW_COMPUTATIONS = {
     "particle smoother": lambda: particles(lfm.particle_smoother, draws=2),
-    "fit of a mode and forecast": lambda: fit_and_forecast(counts, seed=3, sampler="map"),
     "fit": lambda: fit_and_forecast(counts, seed=3),
-    "random walk": lambda: fit_and_forecast(counts, seed=3, sampler="ram"),
     "particle-marginal": lambda: fit_and_forecast(counts, seed=3, sampler="pmmh", sampler_options={"particles": 8}),
     "regimes": lambda: fit_and_forecast(decays, seed=3, sampler="map"),
 }

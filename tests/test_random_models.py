@@ -15,7 +15,6 @@ import pytest
 from random_models import AHEAD, ROWS, Series, Structure, batch, build, structure
 
 import lfm_ppl as lfm
-from lfm_ppl.utils.programs import forget_executables
 
 CUT = 4
 FEW, MANY = 4, 12
@@ -153,11 +152,7 @@ def test_a_few_structures(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(0, 300, 5))
-def test_many_structures(first):
-    failures = []
-    for seed in range(first, first + 5):
-        failures += complaints(seed, MANY)
-        jax.clear_caches()
-        forget_executables()
+@pytest.mark.parametrize("seed", range(0, 300, 30))
+def test_many_structures(seed, release_programs_of_test):
+    failures = complaints(seed, MANY)
     assert not failures, "\n".join(failures)

@@ -73,8 +73,10 @@ class SharedState(Force):
     def discretise(self, dt: ArrayLike) -> tuple[jax.Array, jax.Array]:
         """Return transition (n, n) and process noise (n, n) over a step of length dt >= 0."""
         transition, noise = self.force.discretise(dt)
-        return (matmul(matmul(self._to_reference, transition), self._from_reference),
-                congruence(self._to_reference, noise))
+        identity = jnp.eye(self.state_dim)
+        # T and its inverse are rounded: of the change alone, a step of no length stays the identity.
+        change = matmul(matmul(self._to_reference, transition - identity), self._from_reference)
+        return identity + change, congruence(self._to_reference, noise)
 
     def measurement(self, t: ArrayLike) -> jax.Array | np.ndarray:
         """Return H (n,), which is that of the force, as u itself is the first of the quantities that are equal."""

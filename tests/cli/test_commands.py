@@ -249,11 +249,3 @@ def test_a_warning_is_shown_once(capsys):
     for text in ("the input\n ends", "the input ends", "another"):
         show(UserWarning(text), UserWarning, "file", 1)
     assert capsys.readouterr().err == "lfm-ppl: warning: the input ends\nlfm-ppl: warning: another\n"
-
-
-@pytest.mark.slow
-def test_the_first_command_of_the_readme_does_not_diverge(run):
-    status, out, err = run("fit room --out first")
-    assert status == 0 and "diverged" not in out + err
-    summary = arviz_data.summary(arviz_data.load("first"))
-    assert summary["r_hat"].max() < 1.01 and summary["ess_bulk"].min() > 1000

@@ -69,8 +69,8 @@ def test_data_are_simulated_from_the_constrained_prior():
 
 
 @pytest.mark.slow
-def test_nuts_is_calibrated_over_100_data_sets(tmp_path):
-    result = calibration.calibrate(jax.random.key(5), transcription, TIMES, NUTS, data_sets=100, draws=15, thin=3,
+def test_nuts_is_calibrated_over_64_data_sets(tmp_path):
+    result = calibration.calibrate(jax.random.key(5), transcription, TIMES, NUTS, data_sets=64, draws=15, thin=3,
                                    warmup=100, batch=1, checkpoint=tmp_path)
     assert set(result.ranks) == {"lengthscale", "decay", "log likelihood"}
     values = {name: calibration.p_values(rank, result.draws, bins=8) for name, rank in result.ranks.items()}

@@ -54,8 +54,6 @@ def data(count, span):
 CASES = {
     "one": (8, 5.0, {"factor": 0.0}, {}),
     "two": (8, 5.0, {"factor": 0.0}, {"factor": 1.2}),
-    "upper": (8, 5.0, {}, {"factor": 0.5}),
-    "state": (8, 5.0, {"x": 0.05}, {}),
     "state and force": (6, 5.0, {"x": 0.0, "factor": 0.0}, {"factor": 1.2}),
 }
 

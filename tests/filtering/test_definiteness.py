@@ -57,7 +57,7 @@ def passes(model, variance, noise):
 
 @pytest.mark.parametrize("build, order, linear", [
     (second_order, 1, False), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
-        (second_order, 1, True), (first_order, 0, False), (first_order, 2, False), (second_order, 2, False)))])
+        (second_order, 1, True), (first_order, 2, False)))])
 def test_smallest_eigenvalue(build, order, linear):
     model = build(order, linear, 0.0, 1.0)
     for variance in (0.0, 1e-12, 1.0):
@@ -73,8 +73,7 @@ def test_smallest_eigenvalue(build, order, linear):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steps", [1, 7])
-@pytest.mark.parametrize("link", [identity, softplus])
+@pytest.mark.parametrize(("link", "steps"), [(identity, 1), (softplus, 7)])
 def test_the_force_keeps_its_stationary_distribution(link, steps):
     """Nothing is learnt from the observation of an output that the force does not reach."""
     model = motif(link, order=2)

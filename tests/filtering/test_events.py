@@ -359,8 +359,7 @@ def test_wrong_arguments_of_events_are_refused():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("negative_binomial", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_counts_of_a_state_that_is_zero_at_a_row(negative_binomial):
+def test_counts_of_a_state_that_is_zero_at_a_row():
     """The integral of an unknown constant rate, from zero at the first row on: log evidence and gradient by quadrature.
 
     The count at rate zero is zero with probability one, and any other count is impossible there.
@@ -368,13 +367,10 @@ def test_counts_of_a_state_that_is_zero_at_a_row(negative_binomial):
     times, counts = np.array([0.0, 1.0, 2.0, 4.0, 5.0]), np.array([0.0, 2.0, 5.0, 7.0, 1.0])
     gaps = np.diff(times, prepend=0.0)
 
-    def family(function):
-        return (lfm.NegativeBinomialObservation(function, 3.0, "identity") if negative_binomial
-                else lfm.PoissonObservation(function, "identity"))
-
     def log_density(mean, y=counts):
         model = lfm.LatentForceModel(
-            lambda x, u, t: u, {"rate": lfm.Constant(0.5, mean=mean)}, family(lambda x, u, t: x),
+            lambda x, u, t: u, {"rate": lfm.Constant(0.5, mean=mean)},
+            lfm.PoissonObservation(lambda x, u, t: x, "identity"),
             lfm.Gaussian(jnp.zeros(1), jnp.zeros((1, 1))), initial_time=0.0, state_names=("n",),
             events=[lfm.Reset(times, "n")])
         return lfm.MarginalLikelihood(model, times).log_prob(jnp.asarray(y)[:, None])
@@ -383,8 +379,7 @@ def test_counts_of_a_state_that_is_zero_at_a_row(negative_binomial):
         rate = np.linspace(1e-9, 8.0, 4001)
         log_terms = stats.norm.logpdf(rate, mean, 0.5) + np.log(rate[1] - rate[0])
         for count, gap in zip(counts[1:], gaps[1:], strict=True):
-            log_terms += (stats.nbinom.logpmf(count, 3.0, 3.0 / (3.0 + gap * rate)) if negative_binomial
-                          else stats.poisson.logpmf(count, gap * rate))
+            log_terms += stats.poisson.logpmf(count, gap * rate)
         return special.logsumexp(log_terms)
 
     value, gradient = jax.jit(jax.value_and_grad(log_density))(3.0)

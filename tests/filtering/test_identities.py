@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rules import RULES
 from systems import Motif, first_state, identity, motif, softplus, whole_state
 
 import lfm_ppl as lfm
@@ -112,8 +111,8 @@ def three_times(x, u, t):
 
 
 @pytest.mark.parametrize("rule", [
-    pytest.param(rule, marks=() if isinstance(rule, lfm.MonteCarlo) else pytest.mark.slow)
-    for rule in RULES], ids=lambda rule: rule.name)
+    lfm.MonteCarlo(50, seed=1), pytest.param(lfm.Unscented(0.8, 2.0, 1.0), marks=pytest.mark.slow)],
+    ids=lambda rule: rule.name)
 def test_rules_agree_on_a_linear_model(rule):
     model = motif(identity, variance=0.1)
     assert_same(moments_of(lfm.filter(model, TIMES, Y, rule=rule)), moments_of(lfm.filter(model, TIMES, Y)), 1e-10)

@@ -36,10 +36,6 @@ def wave_numpy(t):
     return 0.5 * np.sin(1.1 * t) + 0.2
 
 
-def scaled_wave(t):
-    return jnp.array([1.0, -0.5]) * jnp.cos(0.7 * t)
-
-
 # Gaps, replicates, observations at and after the initial time.
 TIMES = np.array([0.5, 0.5, 0.9, 1.0, 2.2, 2.2, 2.2, 3.0, 6.5, 6.6])
 
@@ -110,7 +106,7 @@ def _cases() -> dict[str, Any]:
     heated = {"constant": 0.2, "additive": Heated(heater()), "breaks": (0.5, 1.0, 3.0, 6.5),
               "reference_additive": lambda t: np.array([np.interp(t, [0.5, 1.0, 3.0, 6.5], [0.0, 2.0, -1.0, 0.5]), 0])}
     return {
-        **{f"matern {p}": lambda p=p: regression(p) for p in range(6)},
+        **{f"matern {p}": lambda p=p: regression(p) for p in (2, 5)},
         "motif, known start": lambda: linear_case(**genes, **single, constant=0.3),
         "motif, uncertain start": lambda: linear_case(**genes, **single, variance=[[0.5, 0.2], [0.2, 0.3]], start=-1.0),
         "motif, rough force and process noise": lambda: linear_case(
@@ -122,15 +118,9 @@ def _cases() -> dict[str, Any]:
             GENES, [[1.0, 0.3], [0.5, -0.4]], {"a": m(1.0, 1.3, 1), "b": m(0.7, 0.6, 2) + m(0.5, 3.0, 0)},
             [matern(1.0, 1.3, 1), added(matern(0.7, 0.6, 2), matern(0.5, 3.0, 0))],
             output=[[1.0, 0, 0, 0], [0, 1.0, 0, 0.5]]),
-        "constant mean": lambda: linear_case(
-            **genes, forces={"u": m(1.0, 1.3, 1, mean=1.5)}, kernels=single["kernels"],
-            means=[lambda t: np.full_like(t, 1.5)], variance=np.eye(2)),
         "mean function": lambda: linear_case(
             **genes, forces={"u": m(1.0, 1.3, 1, mean=smooth_wave)}, kernels=single["kernels"], means=[wave_numpy],
             steps=100),
-        "additive function": lambda: linear_case(
-            **genes, **single, additive=scaled_wave, steps=100,
-            reference_additive=lambda t: np.array([1.0, -0.5]) * np.cos(0.7 * t)),
         # The filter's rows end at the kinks of the input.
         "known input": lambda: linear_case(**genes, **single, **heated, steps=100),
     }
@@ -179,7 +169,7 @@ def test_leave_one_out(case, smoothed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["matern 2", "motif, known start", "spring", "two forces, one a sum", "mean function"])
+@pytest.mark.parametrize("name", ["motif, known start", "mean function"])
 def test_filter(name):
     case = CASES[name]()
     result = lfm.filter(case.model, case.times, case.y, steps=case.steps)
@@ -242,10 +232,8 @@ GRADIENTS = {
     # A decay that equals the force's rate: repeated roots.
     "motif, repeated roots": (build_motif, dense_motif,
                               [np.sqrt(3) / 1.3, 1.1, 1.0, 0.5, 0.3, 0.2, 1.2, 1.3, 0.04, 0.4, 0.2]),
-    "spring": (build_spring, dense_spring, [2.0, 0.4, 1.0, 2.0, 0.04]),
     # Critical damping, of an oscillator as fast as the force; then none.
     "spring, critical": (build_spring, dense_spring, [1.25, 2 * np.sqrt(1.25), 1.0, 2.0, 0.04]),
-    "spring, undamped": (build_spring, dense_spring, [2.0, 0.0, 1.0, 2.0, 0.04]),
 }
 
 

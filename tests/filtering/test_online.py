@@ -68,10 +68,9 @@ def repeating(period_decay, lengthscale):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cut", [pytest.param(3, marks=pytest.mark.slow), 12])
-def test_forces_that_jump_go_on_in_compiled_code(cut):
+def test_forces_that_jump_go_on_in_compiled_code():
     """The times are known; the state comes from the same compiled function, or from outside of it as an argument."""
-    times = TIMES[:18]
+    cut, times = 12, TIMES[:18]
     decays = jnp.array([0.7, 2.0])
 
     def first(decay):

@@ -57,8 +57,7 @@ def dense(evolution):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("evolution", [
-    pytest.param(name, marks=() if name == "SQM" else pytest.mark.slow) for name in EVOLUTIONS])
+@pytest.mark.parametrize("evolution", ["SQM", pytest.param("WQM", marks=pytest.mark.slow)])
 def test_a_driven_state_is_that_of_dense_algebra(evolution):
     """All eigenfunctions above 1e-12; times asked for, one of them a change point; replicates; a missing entry."""
     force = lfm.QuasiPeriodic(kernel(), EVOLUTIONS[evolution], gamma=1e-12)

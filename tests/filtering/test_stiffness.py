@@ -73,8 +73,8 @@ def test_likelihood_filter_smoother_and_panel_say_it_and_compiled_code_does_not(
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("rate", [30.0, pytest.param(300.0, marks=pytest.mark.slow)])
-def test_a_fast_linear_decay_to_a_function_of_a_force_needs_no_remedy(rate):
+def test_a_fast_linear_decay_to_a_function_of_a_force_needs_no_remedy():
+    rate = 30.0
     model = lfm.LatentForceModel(
         lambda x, u, t: rate * (jax.nn.softplus(u) - x), {"u": lfm.Matern(1e-4, 5.0, mean=3.0)}, NOISE,
         lfm.Gaussian(jnp.array([3.0486]), 1e-6 * jnp.eye(1)), state_names=("sensor",), initial_time=0.0)

@@ -1,6 +1,5 @@
 """The origin of time is a convention: no result may depend on it."""
 
-import itertools
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,9 +28,9 @@ def stamps(origin, rate, jitter):
     return times, times - times[0]
 
 
-@pytest.mark.parametrize("origin, jitter, rate, drag", [(1.7e9, 0.2, 1e4, 0.3), *(
-    pytest.param(*case, marks=pytest.mark.slow) for case in itertools.product(
-        (1e6, 1.7e9), (0.0, 0.2), (1.0, 1e3, 1e4), (0.0, 0.3)) if case[3] == 0.0 or case[2] > 1.0)])
+@pytest.mark.parametrize("origin, jitter, rate, drag", [
+    (1.7e9, 0.2, 1e4, 0.3), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
+        (1e6, 0.0, 1.0, 0.0), (1.7e9, 0.2, 1e3, 0.0)))])
 def test_the_log_likelihood_does_not_depend_on_the_origin(origin, jitter, rate, drag):
     times, since = stamps(origin, rate, jitter)
     y = np.sin(2 * np.pi * 0.08 * rate * since)[:, None] + 0.05 * np.random.default_rng(2).normal(size=(ROWS, 1))

@@ -60,34 +60,24 @@ def check(link, genes, variance, steps, iterations, requested_times=AT, noise_sd
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("link", "genes", "variance", "steps", "iterations"), [
-    (identity, 5, 0.0, 10, 0), pytest.param(softplus, 2, 1e-10, 3, 3, marks=pytest.mark.slow),
-    pytest.param(identity, 1, 1e8, 10, 0, marks=pytest.mark.slow),
-    pytest.param(softplus, 5, 0.0, 1, 0, marks=pytest.mark.slow)])
+    (identity, 5, 0.0, 10, 0), pytest.param(softplus, 2, 1e-10, 3, 3, marks=pytest.mark.slow)])
 def test_draws_have_the_reported_moments(link, genes, variance, steps, iterations):
     check(link, genes, variance, steps, iterations)
 
 
 @pytest.mark.slow
-def test_draws_of_many_steps_at_the_data_have_the_reported_moments():
-    """What moves five genes over an interval is of rank two but for rounding, and no ``at`` corrects the draws."""
-    check(softplus, 5, 1.0, 50, 0, requested_times=None)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("iterations", [0, 3])
-@pytest.mark.parametrize("steps", [1, 10, 50])
-@pytest.mark.parametrize("variance", [0.0, 1e-10, 1.0, 1e6])
-@pytest.mark.parametrize("genes", [1, 3, 5])
+@pytest.mark.parametrize(("genes", "variance", "steps", "iterations"), [
+    (1, 1e8, 10, 3), (3, 0.0, 1, 3), (5, 1.0, 50, 0)])
 def test_draws_of_many_settings_have_the_reported_moments(genes, variance, steps, iterations):
+    """Among them many steps of five genes: what moves these over an interval is of rank two but for rounding."""
     for requested_times in (AT, None):
         check(softplus, genes, variance, steps, iterations, requested_times)
-        if iterations == 0:
-            check(identity, genes, variance, steps, iterations, requested_times)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(set(loading.available()) - {"gps"}))
-def test_draws_of_every_model_file_have_the_reported_moments(name):
+@pytest.mark.parametrize("name", ["pharmacokinetics", "heat", "home-heating"])
+def test_draws_of_a_model_file_have_the_reported_moments(name):
+    """Of one with doses, one with many states and one with a known input."""
     file = loading.load(name)
     data = file.simulate()
     if file.prepare is not None:
@@ -116,15 +106,14 @@ def test_requested_times_share_the_steps_of_an_interval():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("iterations", [0, 3])
-def test_requested_times_move_the_moments_by_the_integration_error(iterations):
+def test_requested_times_move_the_moments_by_the_integration_error():
     """The error of an interval that is divided is that of its steps, of fourth order."""
     model, y = motif(softplus, genes=2, noise_sd=0.0682), observed(2, softplus)
     requested_times = np.array([0.5, 3.1, 9.3])
 
     def difference(steps):
-        plain = lfm.smooth(model, TIMES, y, steps=steps, iterations=iterations)
-        divided = lfm.smooth(model, TIMES, y, steps=steps, iterations=iterations, at=np.append(requested_times, TIMES))
+        plain = lfm.smooth(model, TIMES, y, steps=steps)
+        divided = lfm.smooth(model, TIMES, y, steps=steps, at=np.append(requested_times, TIMES))
         sd = np.sqrt(np.diagonal(plain.covariance, axis1=1, axis2=2))
         change = np.abs(divided.mean[len(requested_times):] - plain.mean)
         assert change[sd < 1e-9].max(initial=0.0) < 1e-9

@@ -51,7 +51,8 @@ EXACT = [name for name in FORCES if not name.startswith(
     ("squared", "oscillator", "jumping", "quasi", "shared_squared")) and name not in ("periodic", "periodic_moderated")]
 # Compiled by default, at least one of each kind; the others with -m slow.
 QUICK = ("matern_1", "matern_5", "squared_exponential_6", "wiener_velocity", "random_walk", "damped_resonator",
-         "sparse_spectrum", "constant", "sum", "cqm", "sqm", "wqm", "periodic", "quasi_periodic_steps", "jumping_sum")
+         "sparse_spectrum", "constant", "sum", "cqm", "sqm", "wqm", "periodic", "quasi_periodic_steps", "jumping_sum",
+         "shared_matern")
 QUICK_DERIVATIVES = ("matern_1", "oscillator")
 
 

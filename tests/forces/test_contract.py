@@ -104,7 +104,8 @@ def test_derivatives(build_to_differentiate):
     for value, expected in zip(values[:2], steps(build(SCALE, LENGTHSCALE), points[:, 2]), strict=True):
         assert_allclose(value[:4], expected, rtol=1e-12, atol=1e-14)
     for gradient, backward, value in zip(forward[:2], reverse[:2], values[:2], strict=True):
-        assert_allclose(gradient[:4], backward[:4], rtol=1e-12, atol=1e-14)
+        # Of a matrix with large entries small ones are rounded as their sums are.
+        assert_allclose(gradient[:4], backward[:4], rtol=1e-12, atol=1e-14 * max(1.0, np.abs(gradient[:4]).max()))
         for i, (upper, lower) in enumerate(value[-24:].reshape(3, 2, *gradient[:4].shape[:-1])):
             assert_allclose(gradient[:4, ..., i], (upper - lower) / (2 * h), rtol=1e-6, atol=3e-7)
 

@@ -80,7 +80,7 @@ def test_the_error_is_the_spectral_mass_left_out(order, functions=9):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("order", "largest"), [
-    ("se", 0.01), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((2, 0.01), (1, 0.015), (0, 0.064)))])
+    ("se", 0.01), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((0, 0.064),))])
 def test_the_default_is_as_good_as_documented(order, largest):
     """At all lengthscales; the largest errors are where a pair is only just left out."""
     errors = []
@@ -186,8 +186,7 @@ def kernels(p):
                 p[2])}
 
 
-@pytest.mark.parametrize("kind", ["stationary", pytest.param("moderated", marks=pytest.mark.slow),
-                                  pytest.param("function", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["stationary", pytest.param("moderated", marks=pytest.mark.slow)])
 def test_derivatives_by_all_parameters_are_finite_differences(kind):
     """First and second ones, the period among the parameters."""
     t = np.array([0.4, 3.1, 8.8, 17.0, 31.0])
@@ -223,8 +222,7 @@ def test_repeated_eigenvalues_have_finite_derivatives():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("evolution", [forces.CQM(12.0), forces.SQM(1.5, POINTS), forces.WQM(0.4, POINTS)],
-                         ids=["CQM", "SQM", "WQM"])
+@pytest.mark.parametrize("evolution", [forces.CQM(12.0), forces.WQM(0.4, POINTS)], ids=["CQM", "WQM"])
 def test_simulated_weights_have_the_published_covariance(evolution):
     t, draws = np.array([3.0, 8.0, 20.0, 22.0, 37.0]), 20_000
     model = lfm.LatentForceModel(lambda x, u, t: x, {"a": evolution}, lfm.GaussianObservation(

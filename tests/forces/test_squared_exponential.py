@@ -170,9 +170,7 @@ def log_likelihood_error(order, times, ell, sd):
 @pytest.mark.thorough
 @pytest.mark.parametrize(("order", "sd", "error"), [
     (DEFAULT, 0.01, 0.0215), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
-        (2, 1.0, 1.6), (2, 0.1, 18.5), (2, 0.01, 105.0), (4, 1.0, 0.076), (4, 0.1, 0.9), (4, 0.01, 24.5),
-        (6, 1.0, 0.054), (6, 0.1, 0.076), (6, 0.01, 0.106), (7, 1.0, 0.0115), (7, 0.1, 0.0155),
-        (8, 1.0, 0.0012), (8, 0.1, 0.0016), (8, 0.01, 0.0026)))])
+        (2, 0.01, 105.0), (4, 0.01, 24.5), (6, 0.01, 0.106), (7, 1.0, 0.0115), (8, 0.01, 0.0026)))])
 def test_error_of_the_log_likelihood_is_as_documented(order, sd, error):
     errors = [log_likelihood_error(order, np.linspace(0.0, 1.0, count), ell, sd)
               for count in (20, 200) for ell in (0.1, 0.3, 1.0, 3.0)]
@@ -210,14 +208,13 @@ def draw(rng, count, driven=False, ell=None, sd=None):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("driven", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_log_likelihood_of_the_filter_is_that_of_the_exact_process(driven):
+def test_log_likelihood_of_the_filter_is_that_of_the_exact_process():
     rng = np.random.default_rng(5)
     for ell, sd in ((0.1, 0.01), (0.5, 0.01), (3.0, 0.01), (0.2, 0.3)):
-        ell, sd, times, y, exact = draw(rng, 60, driven, ell, sd)
+        ell, sd, times, y, exact = draw(rng, 60, True, ell, sd)
         expected = exact.log_likelihood(times, y)
         for order, bound in ((DEFAULT, 0.03), (8, 0.004)):
-            assert abs(of_filter(ell, sd, times, y, order, driven, 1.0) - expected) < bound
+            assert abs(of_filter(ell, sd, times, y, order, True, 1.0) - expected) < bound
 
 
 def test_the_filter_has_the_log_likelihood_of_its_covariance_function():
@@ -242,12 +239,10 @@ def test_posterior_of_the_force_is_that_of_the_exact_process():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("driven", [False, True])
-@pytest.mark.parametrize(("order", "bound"), [(6, 0.12), (DEFAULT, 0.03), (8, 0.004)])
-def test_log_likelihoods_of_100_data_sets(order, bound, driven):
+def test_log_likelihoods_of_12_data_sets():
     rng = np.random.default_rng(8)
     worst = 0.0
-    for index in range(100):
-        ell, sd, times, y, exact = draw(rng, (20, 60, 200)[index % 3], driven)
-        worst = max(worst, abs(of_filter(ell, sd, times, y, order, driven, 1.0) - exact.log_likelihood(times, y)))
-    assert worst < bound, worst
+    for index in range(12):
+        ell, sd, times, y, exact = draw(rng, (20, 60, 200)[index % 3], True)
+        worst = max(worst, abs(of_filter(ell, sd, times, y, DEFAULT, True, 1.0) - exact.log_likelihood(times, y)))
+    assert worst < 0.03, worst

@@ -44,19 +44,11 @@ def assert_uniform(name, result, bins):
 
 
 @pytest.mark.slow
-def test_ram_is_calibrated_on_the_linear_motif():
-    result = calibration.calibrate(jax.random.key(11), motif, TIMES, lfm.RAM, data_sets=40, thin=40, warmup=1000)
-    assert set(result.ranks) == {"decay", "sensitivity", "lengthscale", "noise_sd", "log likelihood"}
-    assert_uniform("small_ram_linear", result, bins=8)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", [motif, softplus], ids=["linear", "softplus"])
-@pytest.mark.parametrize("sampler", ["nuts", "ram"])
+@pytest.mark.parametrize(("sampler", "model"), [("nuts", motif), ("ram", softplus)], ids=["nuts", "ram"])
 def test_samplers_are_calibrated(sampler, model):
     settings = {
-        "nuts": {"kernel": lambda m: NUTS(m, forward_mode_differentiation=True), "thin": 3, "warmup": 300, "batch": 20},
+        "nuts": {"kernel": lambda m: NUTS(m, forward_mode_differentiation=True), "thin": 3, "warmup": 150, "batch": 20},
         "ram": {"kernel": lfm.RAM, "thin": 60, "warmup": 2000},
     }[sampler]
-    result = calibration.calibrate(jax.random.key(12), model, TIMES, data_sets=240, **settings)
-    assert_uniform(f"{sampler}_{model.__name__}", result, bins=16)
+    result = calibration.calibrate(jax.random.key(12), model, TIMES, data_sets=80, draws=31, **settings)
+    assert_uniform(f"{sampler}_{model.__name__}", result, bins=8)

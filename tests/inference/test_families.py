@@ -43,15 +43,7 @@ def lengthscale():
     return numpyro.sample("lengthscale", dist.LogNormal(0.4, 0.4))
 
 
-# Two parameters, to be calibrated.
-
-
-def counts(times, y=None):
-    level = numpyro.sample("level", dist.Normal(0.7, 0.7))
-    observed(lfm.PoissonObservation(lambda x, u, t: level + u), times, y, scale())
-
-
-# As many as a family has, from which densities are drawn.
+# With as many parameters as a family has.
 
 
 def poisson(times, y=None):
@@ -99,9 +91,8 @@ def inflated(times, y=None):
 FAMILIES = {"Poisson": poisson, "Poisson, softplus": softplus_poisson, "negative binomial": negative_binomial,
             "Bernoulli": bernoulli, "binomial": binomial, "Student-t": student_t, "censored": censored,
             "zero-inflated": inflated}
-FILES = {"coal": {}, "epidemic": {}, "transcription": {"df": 4.0}, "ballistic": {"df": 4.0}, "ginzburg-landau": {},
-         "spring": {}, **{f"transcription {link}": {"link": link} for link in (
-             "softplus", "linear", "saturation", "repression", "exponential")}}
+FILES = {"epidemic": {}, "transcription": {"df": 4.0}, "ginzburg-landau": {},
+         "transcription exponential": {"link": "exponential"}}
 # Explicit integration with the model's own 60 steps is unstable in the stiffest wells.
 MOST_FAILURES = {"ginzburg-landau": 0.05}
 
@@ -113,25 +104,15 @@ def assert_uniform(result, bins):
 
 
 @pytest.mark.slow
-def test_random_walks_with_expectation_propagation_are_calibrated():
-    """A small one: 24 data sets of 6 rows, and random walks, whose program is a fraction of that of NUTS."""
-    result = calibration.calibrate(jax.random.key(4), counts, np.arange(6.0), lfm.RAM, data_sets=24, draws=15, thin=10,
-                                  warmup=150)
-    assert {"level", "scale", "log likelihood"} == set(result.ranks)
-    assert_uniform(result, bins=4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["Poisson", "Student-t"])
-def test_nuts_with_expectation_propagation_is_calibrated(name, tmp_path):
-    """200 data sets of 32 rows and all parameters; with LFM_SBC_OUT they are kept there, and the run goes on."""
-    folder = Path(os.environ.get("LFM_SBC_OUT", tmp_path)) / name
-    result = calibration.calibrate(jax.random.key(3), FAMILIES[name], 0.5 * np.arange(32.0),
-                                  lambda model: NUTS(model, max_tree_depth=6), data_sets=200, draws=31, thin=10,
+def test_nuts_with_expectation_propagation_is_calibrated(tmp_path):
+    """100 data sets of 32 rows and all parameters; with LFM_SBC_OUT they are kept there, and the run goes on."""
+    folder = Path(os.environ.get("LFM_SBC_OUT", tmp_path)) / "Poisson"
+    result = calibration.calibrate(jax.random.key(3), poisson, 0.5 * np.arange(32.0),
+                                  lambda model: NUTS(model, max_tree_depth=6), data_sets=100, draws=31, thin=10,
                                   warmup=200, batch=20, checkpoint=folder, report=print)
     assert {"scale", "lengthscale", "log likelihood"} < set(result.ranks)
-    assert all(len(rank) == 200 for rank in result.ranks.values())
-    assert_uniform(result, bins=16)
+    assert all(len(rank) == 100 for rank in result.ranks.values())
+    assert_uniform(result, bins=8)
 
 
 def densities(model, times, y, count, keywords=None, fixed_values=None, seed=0):
@@ -178,15 +159,15 @@ def assert_nearly_all_have_a_density(name, z, run):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name, count", [("Student-t", 25), *(pytest.param(name, 10_000, marks=pytest.mark.slow)
-                                                              for name in FAMILIES)])
+@pytest.mark.parametrize("name, count", [("Student-t", 25), *(pytest.param(name, 1_000, marks=pytest.mark.slow)
+                                                              for name in FAMILIES if name != "Student-t")])
 def test_draws_of_the_prior_have_a_density_and_a_gradient(name, count):
     assert_nearly_all_have_a_density(name, *densities(FAMILIES[name], TIMES, data(name), count))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
-def test_draws_of_the_prior_of_a_file_have_a_density_and_the_gradient_of_differences(name, count=2_000):
+def test_draws_of_the_prior_of_a_file_have_a_density_and_the_gradient_of_differences(name, count=500):
     z, run = of_file(name, count)
     value, gradient = assert_nearly_all_have_a_density(name, z, run)
     if name == "ginzburg-landau":

@@ -98,7 +98,7 @@ def filtered(times, y=None, gain=None):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("model", [
-    filtered, pytest.param(branching, marks=pytest.mark.slow), pytest.param(structured, marks=pytest.mark.slow)])
+    filtered, pytest.param(structured, marks=pytest.mark.slow)])
 def test_a_model_that_needs_values_is_compiled_for_them(model):
     cases = [(TIMES, 0.1), (1.1 * TIMES + 20.0 * (TIMES == 8.0), 0.1), (TIMES, 0.0)]
     for times, gain in cases[:2] if model is filtered else cases:

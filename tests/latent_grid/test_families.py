@@ -72,7 +72,7 @@ def slices(model, times, y, chains=4, draws=1000, thin=100, warmup=5000):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [
-    "Poisson", "Bernoulli", "negative binomial", "Student-t", "coal 111", "coal 333"])
+    "Bernoulli", "Student-t", "coal 111"])
 def test_moments_are_those_of_elliptical_slices(name):
     """Means within 0.05 sd and sds within 3%, each beyond four of its own Monte Carlo errors."""
     model, times, y = problem(name)

@@ -62,8 +62,7 @@ IRREGULAR = np.sort(np.random.default_rng(0).uniform(0.0, 100.0, 700))
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", [name if name == "rough" else pytest.param(name, marks=pytest.mark.slow)
-                                  for name in EVOLUTIONS])
+@pytest.mark.parametrize("name", ["rough", pytest.param("slow", marks=pytest.mark.slow)])
 def test_the_estimate_is_the_error_of_dense_algebra(name):
     evolution, kernel = EVOLUTIONS[name]
     for times in (WEEKLY[:300], WEEKLY, IRREGULAR) if name != "rough" else (WEEKLY[:300], IRREGULAR[:300]):

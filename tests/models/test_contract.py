@@ -76,8 +76,7 @@ def test_the_truth_of_the_default_data_is_possible_and_near_the_best(name, optio
     assert np.isfinite(best) and best > max(other_densities) - 30.0
 
 
-@pytest.mark.parametrize("name", [
-    pytest.param(name, marks=[] if name in CHEAP else [pytest.mark.slow]) for name in MODELS])
+@pytest.mark.parametrize("name", CHEAP)
 def test_draws_of_the_prior_have_the_shape_of_the_data(name):
     file = loading.load(name)
     data = file.simulate()

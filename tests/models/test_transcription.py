@@ -205,11 +205,10 @@ def log_evidence(parameters, times, y, link_function, samples=200_000):
 
 @needs_p53
 @pytest.mark.slow
-@pytest.mark.parametrize("link", ["softplus", "exponential"])
-def test_log_evidence_is_that_of_importance_sampling(file, activity, link):
+def test_log_evidence_is_that_of_importance_sampling(file, activity):
     """Within 0.05 at ten draws from the posterior of the p53 data; a single pass is off by up to six nats."""
     data = file.prepare(lfm.read_csv(P53))
-    keywords = file.keywords(data, {"link": link})
+    keywords = file.keywords(data, {"link": "softplus"})
     bound = bind(lfm.approximate(file.model, iterations=0), data.times, data.y, model_kwargs=keywords)
     bound = bound.fix(file.anchors(data))
     objective = bound.objective()
@@ -220,12 +219,12 @@ def test_log_evidence_is_that_of_importance_sampling(file, activity, link):
         constrained = bound.constrain(jnp.asarray(draw))
         parameters = {name: np.asarray(constrained[name]) for name in file.parameters}
         exact, error, effective = log_evidence(parameters, np.asarray(data.times), np.asarray(data.y),
-                                               lambda u: activity(u, link, 0.5))
+                                               lambda u: activity(u, "softplus", 0.5))
         assert error < 0.005 and effective > 10_000
         result = {n: trace(condition(lfm.approximate(file.model, iterations=n), parameters)).get_trace(
             data.times, data.y, **keywords)["y"] for n in (0, 3)}
         single, iterated = (float(site["fn"].log_prob(site["value"])) - exact for site in result.values())
         errors.append(iterated)
         of_single_pass.append(single)
-    print(link, "three iterations", np.round(errors, 3), "single pass", np.round(of_single_pass, 2))
+    print("three iterations", np.round(errors, 3), "single pass", np.round(of_single_pass, 2))
     assert np.abs(errors).max() < 0.05 and np.abs(of_single_pass).max() > 1.0

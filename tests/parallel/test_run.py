@@ -258,7 +258,7 @@ def wait_for_workers(folder):
 
 @pytest.mark.slow
 def test_a_run_killed_at_any_moment_loses_unfinished_tasks_only(tmp_path):
-    generator, files, log, kills = np.random.default_rng(0), {}, [], 20
+    generator, files, log, kills = np.random.default_rng(0), {}, [], 6
     for _ in range(kills):
         process = start_run(tmp_path)
         time.sleep(generator.uniform(0.5, 12.0))

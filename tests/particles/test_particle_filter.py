@@ -56,8 +56,7 @@ def assert_unbiased(estimated, exact):
 
 
 @pytest.mark.parametrize("resampling, threshold", [
-    ("systematic", 0.5), *(pytest.param(*case, marks=pytest.mark.slow) for case in (
-        ("stratified", 1.0), ("multinomial", 1.0), ("systematic", 0.0)))])
+    ("systematic", 0.5), pytest.param("stratified", 1.0, marks=pytest.mark.slow)])
 def test_the_likelihood_is_unbiased(resampling, threshold):
     """Over 1,000 runs against the Kalman filter, which is exact; a start before the data, a replicate, a gap."""
     model = relaxing()
@@ -69,9 +68,7 @@ def test_the_likelihood_is_unbiased(resampling, threshold):
 @pytest.mark.thorough
 @pytest.mark.parametrize("model, scheme, steps", [
     (driven(), "exact", 1), pytest.param(driven(order=0), "srk", 40, marks=pytest.mark.slow),
-    pytest.param(driven(), "srk", 20, marks=pytest.mark.slow),
-    pytest.param(relaxing(), "srk", 20, marks=pytest.mark.slow),
-], ids=["exact", "rough force", "smooth force", "no force"])
+], ids=["exact", "rough force"])
 def test_the_likelihood_is_unbiased_with_forces_and_steps(model, scheme, steps):
     """The bias of the steps is below 0.1% here: it is of order h^2, and halving h does not show it."""
     exact = float(lfm.filter(model, TIMES, Y).log_likelihood.sum())

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from systems import Kicked, double_well, first_state, motif, softplus
+from systems import Kicked, double_well, first_state
 
 import lfm_ppl as lfm
 from lfm_ppl.fokker_planck_grid.fokker_planck import fokker_planck
@@ -85,14 +85,13 @@ def test_replicates_share_the_state():
 @pytest.mark.slow
 @pytest.mark.parametrize("model, reason", [
     (linear(lfm.Constant(1.0)), "not every state of this linear model"),
-    (motif(softplus, genes=1), "not every physical state"),
     (lfm.LatentForceModel(lambda x, u, t: u - x**3, {"u": lfm.Constant(1.0)},
                           lfm.GaussianObservation(first_state, jnp.array([0.1])),
                           lfm.Gaussian(jnp.zeros(1), jnp.ones(1)), process_noise=jnp.eye(1)), "states without noise"),
     (lfm.LatentForceModel(lambda x, u, t: u - x**3, {"u": Kicked(0.3, (0.6,), 1.0, 1.3, 0)},
                           lfm.GaussianObservation(first_state, jnp.array([0.1])),
                           lfm.Gaussian(jnp.zeros(1), jnp.ones(1)), process_noise=jnp.eye(1)), "a force jumps"),
-], ids=["linear", "driven", "constant", "jumps"])
+], ids=["linear", "constant", "jumps"])
 def test_models_without_a_transition_density_are_traced(model, reason):
     with pytest.raises(ValueError, match=reason):
         lfm.particle_smoother(jax.random.key(0), model, TIMES, Y, method="backward simulation")

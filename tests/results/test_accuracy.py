@@ -252,7 +252,7 @@ def test_the_corrected_posterior_is_the_exact_one_on_a_grid_of_parameters(bent):
     posteriors = {}
     at_nodes = replace(problem, draws={"depth": nodes})
     prior = np.asarray(dist.LogNormal(0.0, 0.4).log_prob(nodes))
-    exact = log_likelihoods.on_grid(at_nodes, log_likelihoods.ReferenceSettings("grid", None, 1)).estimates[:, 0]
+    exact = log_likelihoods.on_grid(at_nodes, log_likelihoods.ReferenceSettings("grid", None, 1)).estimates[:, 0, 0]
     wrong = log_likelihoods.gaussian(at_nodes)
     for name, log in (("exact", exact), ("wrong", wrong)):
         density = np.exp(log + prior - (log + prior).max())

@@ -165,16 +165,15 @@ def derivatives(factorise, keep, root, live, weights, floor):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("keep", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("floor", [[0.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 2.0], [0.3, 0.3, 0.3, 0.3]])
 @pytest.mark.parametrize("dead", [(), (0,), (1, 3), (2,)])
-def test_derivatives_of_a_factor_are_those_of_its_operations(keep, floor, dead):
+def test_derivatives_of_a_factor_are_those_of_its_operations(floor, dead):
     """Forwards, backwards, twice and side by side, for regular and degenerate pivots, which depend on their floor."""
     live = np.array([index not in dead for index in range(4)], float)
     root = np.random.default_rng(0).normal(size=(4, 5)) * live[:, None]
     weights = np.random.default_rng(1).normal(size=(2, 4, 4))
 
-    results = (derivatives(f, keep, root, live, weights, np.array(floor)) for f in (at_once, by_columns))
+    results = (derivatives(f, True, root, live, weights, np.array(floor)) for f in (at_once, by_columns))
     for result, expected in zip(*results, strict=True):
         np.testing.assert_allclose(result, expected, rtol=1e-11, atol=1e-12 * np.abs(expected).max())
 
