@@ -18,7 +18,7 @@ from lfm_ppl.inference.kernels.ram import RAM
 from lfm_ppl.inference.kernels.robust_metropolis import robust_metropolis
 from lfm_ppl.inference.nuts import NUTSState, nuts, nuts_options
 from lfm_ppl.inference.problem import Problem, signature
-from lfm_ppl.inference.skew_coordinates import SkewCoordinates
+from lfm_ppl.inference.symmetrising import SymmetrisingTransform
 
 _SLOW_WARMUP_HINT = (
     "this warm-up is slow, and the time left may still grow. From the posterior mode, with the covariance "
@@ -55,17 +55,18 @@ class BoundSampler:
 
 
 def nuts_sampler(bound: BoundModel, num_warmup: int, options: Mapping[str, Any],
-                 coordinates: SkewCoordinates | None = None) -> BoundSampler:
+                 transform: SymmetrisingTransform | None = None) -> BoundSampler:
     """Return NumPyro's NUTS.
 
     Args:
         bound: the model and its data.
         num_warmup: warm-up steps of each chain.
         options: arguments of NUTS.
-        coordinates: of the chains. Their covariance is the initial inverse mass matrix, which is dense, and regularises
-            the estimates of the warm-up. None: the unconstrained parameters, and the warm-up starts with the identity.
+        transform: from the position of a chain to the unconstrained parameters. Its correlation matrix is the initial
+            inverse mass matrix, which is dense, and regularises the estimates of the warm-up. None: there is none, and
+            the warm-up starts with the identity.
     """
-    completed = nuts_options(bound, options, coordinates is not None)
+    completed = nuts_options(bound, options, transform is not None)
     gradient = bound.gradient(bool(completed["forward_mode_differentiation"]))
 
     def evaluate(z: Any) -> tuple[jax.Array, jax.Array]:
@@ -74,11 +75,11 @@ def nuts_sampler(bound: BoundModel, num_warmup: int, options: Mapping[str, Any],
     def describe(state: NUTSState) -> str:
         return _step_size_and_acceptance(state.hmc.adapt_state.step_size, state.hmc.mean_accept_prob)
 
-    has_default_mass = coordinates is None and "inverse_mass_matrix" not in options
+    has_default_mass = transform is None and "inverse_mass_matrix" not in options
     return BoundSampler(
         bound, nuts(bound, num_warmup, completed),
-        ("nuts", num_warmup, coordinates is not None, signature(completed) or object()), evaluate,
-        jax.tree_util.tree_map(jnp.asarray, coordinates), describe, bound.problem,
+        ("nuts", num_warmup, transform is not None, signature(completed) or object()), evaluate,
+        jax.tree_util.tree_map(jnp.asarray, transform), describe, bound.problem,
         _SLOW_WARMUP_HINT if has_default_mass else "")
 
 

@@ -7,7 +7,8 @@
 3. Each chain starts at a draw of the approximation widened to `_WIDENING` standard deviations, so that the chains are
    overdispersed, which R-hat requires. Draws far outside of the posterior, as beyond the edge of a skewed posterior,
    are pulled towards the mode.
-4. C is the initial inverse mass matrix, and it regularises the matrices that NUTS estimates in its warm-up.
+4. C, of the chain's coordinates, is the initial inverse mass matrix, and it regularises the matrices that NUTS
+   estimates in its warm-up.
 
 Source: Stan Development Team, Stan reference manual, "HMC algorithm parameters" (windows and regularisation of the
 warm-up); Gelman and Rubin (1992), Statistical Science 7, 457-472 (overdispersed starting points).

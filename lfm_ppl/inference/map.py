@@ -193,8 +193,8 @@ def mode_of(key: jax.Array, bound: BoundModel, *, init: Any = None, restarts: in
     """Return the posterior mode of a bound model, from starts drawn by a key; arguments as in `map_estimate`.
 
     The search has converged where one further step of Newton's method would raise the log density by less than
-    ``negligible_rise``; None: by less than rounding errors. A density whose integration steps follow a tolerance has
-    small jumps, which end the search before that.
+    ``negligible_rise``; None: 1e-6, or 1e-3 in single precision. A density whose integration steps follow a tolerance
+    has small jumps, which end the search before that.
     """
     objective = bound.objective(jacobian, forward_mode, exact_hessian)
     starts = _starts(bound, key, objective.value, init, restarts)
@@ -203,8 +203,13 @@ def mode_of(key: jax.Array, bound: BoundModel, *, init: Any = None, restarts: in
                    for start in starts]
     minimum = newton(objective, min(search_ends, key=lambda end: end.value).point)
     if negligible_rise is None:
-        negligible_rise = 1e-6 if jnp.result_type(float) == jnp.float64 else 1e-3
-    return _result(bound, objective, minimum, search_ends, jacobian, _verdict(minimum, bound.names, negligible_rise))
+        negligible_rise = _smallest_rise()
+    return _result(bound, objective, minimum, search_ends, jacobian, negligible_rise)
+
+
+def _smallest_rise() -> float:
+    """Return the rise of a log density that rounding errors leave."""
+    return 1e-6 if jnp.result_type(float) == jnp.float64 else 1e-3
 
 
 def _starts(
@@ -265,7 +270,8 @@ def _init_to_values(values: Mapping[str, Any], site: dict) -> Any:
 
 
 def _result(
-    bound: BoundModel, objective: Objective, minimum: Minimum, search_ends: list[End], jacobian: bool, message: str
+    bound: BoundModel, objective: Objective, minimum: Minimum, search_ends: list[End], jacobian: bool,
+    negligible_rise: float
 ) -> MAPResult:
     point, curvature, names = minimum.point, minimum.curvature, bound.names
     unconstrained = {k: np.asarray(v) for k, v in bound.unravel(point).items()}
@@ -276,6 +282,7 @@ def _result(
         start_covariance = curvature.start_covariance
         factor, log_determinant = curvature.factor, curvature.log_determinant
         unidentified = tuple(names[i] for i in curvature.coordinates(curvature.flat))
+    message = _verdict(minimum, names, negligible_rise)
     if message:
         warnings.warn(f"map_estimate did not converge: {message} {_REMEDY}", stacklevel=4)
     elif unidentified:
@@ -300,7 +307,7 @@ def _result(
         converged=not message,
         message=message or "converged",
         unidentified=unidentified,
-        runaway=tuple(np.array(names)[_runaway(minimum)]),
+        runaway=tuple(np.array(names)[_runaway(minimum, negligible_rise)]),
         restart_log_densities=np.array([-end.value for end in search_ends]),
         restart_ends=np.stack([end.point for end in search_ends]),
         evaluations=objective.evaluations,
@@ -318,16 +325,19 @@ def _verdict(minimum: Minimum, names: tuple[str, ...], negligible_rise: float) -
     if np.any(negative):
         where = ", ".join(names[i] for i in curvature.coordinates(negative))
         return f"the search ended at a saddle point, in a direction of {where}."
-    is_runaway = _runaway(minimum)
+    is_runaway = _runaway(minimum, negligible_rise)
     if np.any(is_runaway):
         where = ", ".join(np.array(names)[is_runaway])
         return f"{where} runs away; the mode may lie at the edge of the support or at infinity."
-    rise = max(minimum.decrement, curvature.flat_slope(minimum.gradient))
-    if rise > negligible_rise:
-        return f"the log density still rises by about {rise:.1e} within one step."
+    flat_slope = curvature.flat_slope(minimum.gradient)
+    if minimum.decrement > negligible_rise or flat_slope > _smallest_rise():
+        return f"the log density still rises by about {max(minimum.decrement, flat_slope):.1e} within one step."
     return ""
 
 
-def _runaway(minimum: Minimum) -> np.ndarray:
-    """Return whether Newton's step is long along each coordinate (d,) at the end of the search."""
-    return np.abs(minimum.step) > 1e-3 * (1.0 + np.abs(minimum.point))
+def _runaway(minimum: Minimum, negligible_rise: float) -> np.ndarray:
+    """Return whether Newton's step is long along each coordinate (d,) at the end of the search.
+
+    With a standard deviation of one, a step that raises the log density by r has the length sqrt(2 r).
+    """
+    return np.abs(minimum.step) > math.sqrt(negligible_rise) * (1.0 + np.abs(minimum.point))

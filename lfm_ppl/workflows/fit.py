@@ -149,8 +149,8 @@ def fit(
         init: starting points. By default, or with "map", draws about the posterior mode. For NUTS they come from the
             Laplace approximation N(mode, C) widened to twice its standard deviations. C, the inverse Hessian, is the
             (dense) inverse mass matrix at the start of the warm-up, and its estimates are regularised towards C. The
-            chains move in coordinates in which the posterior is nearly symmetric; draws, densities and files are those
-            of the parameters. Where the Laplace approximation is not usable (a Hessian with a negative eigenvalue,
+            chains move in coordinates in which the posterior is nearly symmetric; ``step_size`` and ``energy`` of the
+            result are those of the coordinates, draws and densities those of the parameters. Where the Laplace approximation is not usable (a Hessian with a negative eigenvalue,
             several modes of similar height, more than 100 parameters), NUTS starts as with "median", at the prior
             median with a unit mass matrix, and prints one line with the reason. Along flat directions C has variance
             one. Or a NumPyro strategy.

@@ -26,7 +26,7 @@ from lfm_ppl.utils.random_keys import split_by_name
 def keys_of(seed: int) -> dict[str, jax.Array]:
     """Return the random keys of a seed: one for each part of a fit, and one for the forecasts of its result."""
     return split_by_name(jax.random.key(seed), ("mode", "chains", "starts", "trajectories", "scores", "forecasts",
-                                               "tuning"))
+                                               "tuning", "transform"))
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """The starting points of the chains of `lfm_ppl.fit`, and the sampler that moves them.
 
 1. NUTS starts at draws from the widened Laplace approximation, whose covariance is its first inverse mass matrix, in
-   coordinates without skewness (`lfm_ppl.inference.skew_coordinates`). Where the approximation is not usable, it starts
-   at the prior median with a unit mass matrix.
+   coordinates in which the posterior is nearly symmetric (`lfm_ppl.inference.symmetrising`). Where the approximation is
+   not usable, it starts at the prior median with a unit mass matrix.
 2. A random walk needs no gradient, but to learn the shape of the posterior by rejection takes thousands of steps. Its
    first proposal covariance is that of the Laplace approximation, and its chains start at draws from it.
 3. Particle-marginal RAM also chooses the number of particles, by default at the mode.
@@ -43,7 +43,7 @@ from lfm_ppl.inference.laplace_start import (
 )
 from lfm_ppl.inference.long_steps import stiff_sites, with_exponential_steps
 from lfm_ppl.inference.map import MAPResult, mode_of
-from lfm_ppl.inference.skew_coordinates import SkewCoordinates, skew_coordinates
+from lfm_ppl.inference.symmetrising import SymmetrisingTransform, symmetrising_transform
 from lfm_ppl.inference.tuning import ANCHOR, Tuning, anchor_at_mode, anchor_attribute, anchored
 from lfm_ppl.utils import checks
 from lfm_ppl.utils.interruption import was_interrupt
@@ -110,15 +110,16 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
     # The Laplace approximation does not regularise a mass matrix of the user.
     is_regularized = "inverse_mass_matrix" not in sampler_options and sampler_options.get("dense_mass", True) is True
 
-    def sampler(bound: BoundModel, coordinates: SkewCoordinates | None, warmup: int) -> BoundSampler:
+    def sampler(bound: BoundModel, transform: SymmetrisingTransform | None, warmup: int) -> BoundSampler:
         num_warmup = warmup * (options.thin or 1)
-        return nuts_sampler(bound, num_warmup, sampler_options, coordinates if is_regularized else None)
+        return nuts_sampler(bound, num_warmup, sampler_options, transform if is_regularized else None)
 
     if setup is not None:
         bound = with_exponential_steps(bound, json.loads(setup.get(EXPONENTIAL, "[]")))
-        # The stored state holds the coordinates; the program needs their shapes only.
+        # The stored state holds the transform; the program needs its shapes only.
         zeros = np.zeros(bound.size)
-        shapes = SkewCoordinates(Laplace(zeros, np.eye(bound.size)), zeros) if setup["init"] == "laplace" else None
+        is_at_mode = setup["init"] == "laplace"
+        shapes = SymmetrisingTransform(Laplace(zeros, np.eye(bound.size)), zeros) if is_at_mode else None
         return ChainStart(sampler(anchored(bound, setup), shapes, setup["warmup"]), None, dict(setup))
     laplace, fallback, stiff = None, {}, []
     is_at_mode = options.init in (None, "map")
@@ -136,7 +137,10 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
     tunings: dict[str, Tuning] = {}
     if laplace is not None:
         bound, tunings = anchor_at_mode(options.keys["tuning"], bound, laplace)
-    nuts = sampler(bound, None if laplace is None else skew_coordinates(bound, laplace), warmup)
+    transform = None
+    if laplace is not None and is_regularized:
+        transform = symmetrising_transform(options.keys["transform"], bound, laplace)
+    nuts = sampler(bound, transform, warmup)
     if is_at_mode:  # the advice for a slow warm-up is to start there
         nuts = dataclasses.replace(nuts, slow_warmup_hint="")
     if laplace is not None:
@@ -218,7 +222,7 @@ def _stiff_attribute(sites: list[str]) -> dict[str, str]:
 def _find_mode(bound: BoundModel, options: FitOptions) -> MAPResult:
     """Return the posterior mode; its warnings concern chains that start there, and no mere proposal covariance."""
     if options.init == "map":
-        return mode_of(options.keys["mode"], bound)
+        return mode_of(options.keys["mode"], bound, negligible_rise=NEGLIGIBLE_RISE)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return mode_of(options.keys["mode"], bound, restarts=2, negligible_rise=NEGLIGIBLE_RISE)

@@ -20,7 +20,7 @@ from lfm_ppl.inference.laplace_start import (
     starting_points,
 )
 from lfm_ppl.inference.map import mode_of
-from lfm_ppl.inference.skew_coordinates import SkewCoordinates
+from lfm_ppl.inference.symmetrising import SymmetrisingTransform
 
 COVARIANCE = np.array([[1.0, 0.9], [0.9, 2.0]])
 
@@ -54,17 +54,18 @@ def test_a_mode_that_does_not_describe_the_posterior_is_refused(model, name):
         laplace_approximation(jax.random.key(0), bound(model))
 
 
-def stairs():
-    """Return a density with small jumps that its gradient does not show, as with adaptive integration steps."""
-    x = numpyro.sample("x", dist.ImproperUniform(dist.constraints.real, (), ()))
-    numpyro.factor("likelihood", 400.0 * (x - jnp.exp(x)) - 1e-6 * jnp.floor(1e5 * x))
+@pytest.mark.parametrize("precision, jump", [(400.0, 1e-6), (1.0, 1e-7)])
+def test_small_jumps_of_the_density_do_not_make_the_mode_unusable(precision, jump):
+    def stairs():
+        """Have small jumps that the gradient does not show, as with adaptive integration steps."""
+        x = numpyro.sample("x", dist.ImproperUniform(dist.constraints.real, (), ()))
+        numpyro.factor("likelihood", precision * (x - jnp.exp(x)) - jump * jnp.floor(1e5 * x))
 
-
-def test_small_jumps_of_the_density_do_not_make_the_mode_unusable():
-    assert "still rises" in mode_of(jax.random.key(0), bound(stairs)).message
+    with pytest.warns(UserWarning, match="did not converge"):
+        mode_of(jax.random.key(0), bound(stairs))
     laplace = laplace_approximation(jax.random.key(0), bound(stairs))
-    assert_allclose(laplace.mode, 0.0, atol=1e-3)
-    assert_allclose(laplace.covariance, 1.0 / 400.0, rtol=1e-3)
+    assert_allclose(laplace.mode, 0.0, atol=0.03)
+    assert_allclose(laplace.covariance, 1.0 / precision, rtol=0.05)
 
 
 DIRECTIONS = {
@@ -117,7 +118,7 @@ def test_points_beyond_a_cliff_are_pulled_towards_the_mode():
 
 
 def test_mass_matrices_are_means_of_draws_and_approximation():
-    coordinates = SkewCoordinates(Laplace(jnp.array([0.5, 0.5]), jnp.array(COVARIANCE)), jnp.zeros(2))
+    transform = SymmetrisingTransform(Laplace(jnp.array([0.5, 0.5]), jnp.array(COVARIANCE)), jnp.zeros(2))
     correlation = COVARIANCE / np.sqrt(np.outer(np.diag(COVARIANCE), np.diag(COVARIANCE)))
     draws = np.random.default_rng(0).normal(size=(30, 2))
     init, update, _ = welford_covariance(diagonal=False)
@@ -126,7 +127,7 @@ def test_mass_matrices_are_means_of_draws_and_approximation():
         adaptation = HMCAdaptState(1.0, None, None, None, None, {("x",): estimate}, 0, None)
         return HMCState(**dict.fromkeys(HMCState._fields) | {"adapt_state": adaptation})
 
-    (estimate,) = nuts._with_pseudo_draws(state(init(2)), coordinates).adapt_state.mm_state.values()
+    (estimate,) = nuts._with_pseudo_draws(state(init(2)), transform).adapt_state.mm_state.values()
     for draw in draws:
         estimate = update(jnp.asarray(draw), estimate)
     mean, sum_of_squares, count = estimate
@@ -137,5 +138,5 @@ def test_mass_matrices_are_means_of_draws_and_approximation():
     expected = 29 * np.cov(draws.T) + weight * correlation + 30 * weight / count * np.outer(shift, shift)
     assert_allclose(sum_of_squares, expected, rtol=1e-12)
     # An estimate that has draws is left alone.
-    (mass_state,) = nuts._with_pseudo_draws(state(estimate), coordinates).adapt_state.mm_state.values()
+    (mass_state,) = nuts._with_pseudo_draws(state(estimate), transform).adapt_state.mm_state.values()
     assert_allclose(mass_state[1], sum_of_squares)

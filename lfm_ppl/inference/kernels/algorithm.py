@@ -17,7 +17,7 @@ class SamplingAlgorithm(NamedTuple):
             energy and, for NUTS, the gradient. ``tuning`` are arrays such as the first proposal covariance.
         step: ``(state, data) -> state``.
         summary: ``state -> {name: array}``: the flat position ``z`` (d,) and the statistics of the last step, named as
-            in ArviZ. ``lp`` is the potential energy.
+            in ArviZ. ``lp`` is minus the log density of ``z``.
     """
 
     init: Callable[[Any, Any, Any, Any], Any]
