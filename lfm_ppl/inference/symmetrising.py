@@ -57,7 +57,7 @@ class SymmetrisingTransform(eqx.Module):
     def correlation(self) -> jax.Array:
         """The covariance (d, d) of x, to first order in the asymmetry."""
         sd = self._sd
-        return self.laplace.covariance / (sd[:, None] * sd)
+        return jnp.asarray(self.laplace.covariance) / (sd[:, None] * sd)
 
     def to_z(self, x: jax.Array) -> jax.Array:
         """Return z (d,)."""
