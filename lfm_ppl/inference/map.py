@@ -183,20 +183,30 @@ def map_estimate(
         )
     bound = bind_arguments(numpyro_model, args, model_kwargs or {}, "map_estimate")
     exact = not bound.has_likelihood if hessian is None else hessian == "autodiff"
-    return mode_of(jax.random.key(seed), bound, init=init, restarts=restarts, jacobian=jacobian,
-                   exact_hessian=exact, forward_mode=forward_mode, max_iterations=max_iterations)
+    return mode_of(jax.random.key(seed), bound, bound.objective(jacobian, forward_mode, exact), init=init,
+                   restarts=restarts, jacobian=jacobian, max_iterations=max_iterations)
 
 
-def mode_of(key: jax.Array, bound: BoundModel, *, init: Any = None, restarts: int = 4, jacobian: bool = True,
-            exact_hessian: bool = False, forward_mode: bool | None = None, max_iterations: int = 1000,
+def mode_of(key: jax.Array, bound: BoundModel, objective: Objective | None = None, *, init: Any = None,
+            restarts: int = 4, jacobian: bool = True, max_iterations: int = 1000,
             negligible_rise: float | None = None) -> MAPResult:
-    """Return the posterior mode of a bound model, from starts drawn by a key; arguments as in `map_estimate`.
+    """Return the posterior mode of a bound model, from starts drawn by a key.
 
     The search has converged where one further step of Newton's method would raise the log density by less than
     ``negligible_rise``; None: 1e-6, or 1e-3 in single precision. A density whose integration steps follow a tolerance
     has small jumps, which end the search before that.
+
+    Args:
+        key: a JAX random key.
+        bound: the model and its data.
+        objective: minus the log density; None: with the default derivatives.
+        init: starting point of the first search, as in `map_estimate`.
+        restarts: number of searches.
+        jacobian: whether the density is that of the unconstrained parameters.
+        max_iterations: largest number of iterations of a search.
+        negligible_rise: see above.
     """
-    objective = bound.objective(jacobian, forward_mode, exact_hessian)
+    objective = objective or bound.objective(jacobian)
     starts = _starts(bound, key, objective.value, init, restarts)
     no_end = End(np.full(bound.size, np.nan), np.inf)
     search_ends = [no_end if start is None else quasi_newton(objective, start, max_iterations, options=_SEARCH)

@@ -22,6 +22,7 @@ that suits the mode is too short, and a step that suits the tail diverges at the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -106,7 +107,7 @@ def symmetrising_transform(key: jax.Array, bound: BoundModel, laplace: Laplace) 
     return transform if spread(transform) < spread(plain) else plain
 
 
-def _asymmetry(log_density: Any, laplace: Laplace) -> np.ndarray:
+def _asymmetry(log_density: Callable[[Any], float], laplace: Laplace) -> np.ndarray:
     """Return t (d,); zero where a density beside the mode is zero, which says nothing about a tail."""
     sd = np.sqrt(np.diag(laplace.covariance))
     peak, mode = log_density(laplace.mode), np.asarray(laplace.mode)
