@@ -58,11 +58,12 @@ def bent(times, y=None):
 
 
 def settling(times, y=None):
-    """Settle within a quarter of an explicit step of the default, so that steps are exponential."""
-    noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
+    """Follow another state within half an explicit step of the default, so that steps are exponential."""
+    growth = numpyro.sample("growth", dist.LogNormal(-0.5, 0.3))
     system = lfm.LatentForceModel(
-        lambda x, u, t: -40.0 * (x + 0.1 * x**3), {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
-        lfm.Gaussian(jnp.array([0.5]), jnp.array([[0.2]])), process_noise=noise * jnp.eye(1))
+        lambda x, u, t: jnp.stack([growth * x[0] * (1.0 - x[0]), 20.0 * (x[0]**2 - x[1])]), {},
+        lfm.GaussianObservation(lambda x, u, t: x[1:], jnp.array([0.3])),
+        lfm.Gaussian(jnp.array([0.5, 0.25]), 0.01 * jnp.eye(2)))
     numpyro.sample("y", lfm.MarginalLikelihood(system, times), obs=y)
 
 
