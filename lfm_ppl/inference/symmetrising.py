@@ -10,7 +10,7 @@ that suits the mode is too short, and a step that suits the tail diverges at the
    with the mode m and the standard deviations s of the Laplace approximation. Its derivative is s_i at the mode, and
    s_i (1 - t_i) and s_i (1 + t_i) in the left and the right tail.
 2. The asymmetry t_i follows from the drops d_- and d_+ of the log density at two standard deviations below and above
-   the mode, where all other coordinates have their conditional means. They are those of a standard normal x at
+   the mode, where all other coordinates have their conditional means. A standard normal x has these drops at
    x = -a_- and a_+ with a = sqrt(2 d), if -a_- + t_i g(a_-) = -(a_+ + t_i g(a_+)), that is
 
        t_i = (a_- - a_+) / (g(a_-) + g(a_+)).
@@ -95,24 +95,29 @@ def symmetrising_transform(key: jax.Array, bound: BoundModel, laplace: Laplace) 
         return float(bound.log_density_gradient(z)[0])  # the program that the starting points need, too
 
     plain = SymmetrisingTransform(laplace, np.zeros(bound.size))
-    transform = SymmetrisingTransform(laplace, _asymmetry(log_density, laplace))
-    x = np.asarray(jax.random.normal(key, (_DRAWS, bound.size))) @ np.linalg.cholesky(np.asarray(plain.correlation)).T
-    normal = -0.5 * (x * np.linalg.solve(np.asarray(plain.correlation), x.T).T).sum(axis=1)
+    transform = SymmetrisingTransform(laplace, _asymmetry(log_density, plain))
+    standard = np.asarray(jax.random.normal(key, (_DRAWS, bound.size)))
+    draws, normal = standard @ np.linalg.cholesky(plain.correlation).T, -0.5 * (standard**2).sum(axis=1)
 
     def spread(transform: SymmetrisingTransform) -> float:
-        values = np.array([log_density(transform.to_z(row)) for row in x])
+        values = np.array([log_density(transform.to_z(x)) for x in draws])
         differences = np.nan_to_num(values - normal, nan=-np.inf)
         return float(np.maximum(differences, differences.max() - _LARGEST_DIFFERENCE).std())
 
     return transform if spread(transform) < spread(plain) else plain
 
 
-def _asymmetry(log_density: Callable[[Any], float], laplace: Laplace) -> np.ndarray:
-    """Return t (d,); zero where a density beside the mode is zero, which says nothing about a tail."""
-    sd = np.sqrt(np.diag(laplace.covariance))
-    peak, mode = log_density(laplace.mode), np.asarray(laplace.mode)
-    ridges = _DISTANCE * np.asarray(laplace.covariance) / sd[:, None]
-    drops = np.array([[peak - log_density(mode + side * ridge) for side in (-1.0, 1.0)] for ridge in ridges])
+def _asymmetry(log_density: Callable[[Any], float], plain: SymmetrisingTransform) -> np.ndarray:
+    """Return t (d,); zero where a density beside the mode is zero, which says nothing about a tail.
+
+    Args:
+        log_density: of z.
+        plain: the transform without asymmetry.
+    """
+    peak = log_density(plain.laplace.mode)
+    # With one coordinate at a distance, all others have their correlations with it as conditional means.
+    drops = np.array([[peak - log_density(plain.to_z(distance * row)) for distance in (-_DISTANCE, _DISTANCE)]
+                      for row in plain.correlation])
     is_known = np.isfinite(drops).all(axis=1) & (drops > 0.0).all(axis=1)
     lower, upper = np.sqrt(2.0 * np.where(is_known[:, None], drops, 1.0)).T
     asymmetry = (lower - upper) / (np.hypot(1.0, lower) + np.hypot(1.0, upper) - 2.0)

@@ -160,7 +160,6 @@ def _log_likelihoods_at(bound: BoundModel, draws: np.ndarray,
 
     run = bound.program(("log likelihoods after iterations", most_steps), lambda: Program(log_likelihoods))
 
-
     @functools.cache  # some numbers are asked for twice
     def at_draws(iterations: int, steps: int) -> np.ndarray:
         return np.asarray(run(jnp.asarray(draws), jnp.asarray(iterations), jnp.asarray(steps), bound.problem))

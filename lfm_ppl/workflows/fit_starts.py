@@ -112,15 +112,16 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
 
     def sampler(bound: BoundModel, transform: SymmetrisingTransform | None, warmup: int) -> BoundSampler:
         num_warmup = warmup * (options.thin or 1)
-        return nuts_sampler(bound, num_warmup, sampler_options, transform if is_regularized else None)
+        return nuts_sampler(bound, num_warmup, sampler_options, transform)
 
+    transform = None
     if setup is not None:
         bound = with_exponential_steps(bound, json.loads(setup.get(EXPONENTIAL, "[]")))
-        # The stored state holds the transform; the program needs its shapes only.
-        zeros = np.zeros(bound.size)
-        is_at_mode = setup["init"] == "laplace"
-        shapes = SymmetrisingTransform(Laplace(zeros, np.eye(bound.size)), zeros) if is_at_mode else None
-        return ChainStart(sampler(anchored(bound, setup), shapes, setup["warmup"]), None, dict(setup))
+        if setup["init"] == "laplace" and is_regularized:
+            # The stored state holds the transform; the program needs its shapes only.
+            zeros = np.zeros(bound.size)
+            transform = SymmetrisingTransform(Laplace(zeros, np.eye(bound.size)), zeros)
+        return ChainStart(sampler(anchored(bound, setup), transform, setup["warmup"]), None, dict(setup))
     laplace, fallback, stiff = None, {}, []
     is_at_mode = options.init in (None, "map")
     if is_at_mode:
@@ -137,7 +138,6 @@ def _find_nuts_start(bound: BoundModel, options: FitOptions, setup: Mapping[str,
     tunings: dict[str, Tuning] = {}
     if laplace is not None:
         bound, tunings = anchor_at_mode(options.keys["tuning"], bound, laplace)
-    transform = None
     if laplace is not None and is_regularized:
         transform = symmetrising_transform(options.keys["transform"], bound, laplace)
     nuts = sampler(bound, transform, warmup)

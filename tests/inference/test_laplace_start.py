@@ -11,7 +11,6 @@ from numpyro.infer.hmc import HMCState
 from numpyro.infer.hmc_util import HMCAdaptState, welford_covariance
 
 from lfm_ppl.inference import nuts
-from lfm_ppl.inference.bind import bind_arguments
 from lfm_ppl.inference.laplace_start import (
     MAX_PARAMETERS,
     Laplace,
@@ -21,16 +20,7 @@ from lfm_ppl.inference.laplace_start import (
 )
 from lfm_ppl.inference.map import mode_of
 from lfm_ppl.inference.symmetrising import SymmetrisingTransform
-
-COVARIANCE = np.array([[1.0, 0.9], [0.9, 2.0]])
-
-
-def bound(model):
-    return bind_arguments(model, (), {}, "test")
-
-
-def gaussian():
-    numpyro.sample("x", dist.MultivariateNormal(jnp.array([1.0, -2.0]), jnp.array(COVARIANCE)))
+from tests.inference.densities import COVARIANCE, bound, gaussian
 
 
 def test_the_approximation_of_a_gaussian_is_the_gaussian():
