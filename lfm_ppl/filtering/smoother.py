@@ -76,7 +76,7 @@ def moments_by_name(kind: str, name: str, names: tuple[str, ...], mean: jax.Arra
 
 
 def input_marginal(result: Any, kind: str, name: str) -> MeanSd:
-    """Return the moments of a force or a state of a result that has those of w = (x, u).
+    """Return the moments of a force or a state of a result that has the moments of w = (x, u).
 
     Args:
         result: with ``input_mean`` (K, M + R), ``input_covariance`` (K, M + R, M + R), and names of states and forces.

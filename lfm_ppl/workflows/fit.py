@@ -150,10 +150,10 @@ def fit(
             Laplace approximation N(mode, C) widened to twice its standard deviations. C, the inverse Hessian, is the
             (dense) inverse mass matrix at the start of the warm-up, and its estimates are regularised towards C. The
             chains move in coordinates in which the posterior is nearly symmetric; ``step_size`` and ``energy`` of the
-            result are those of the coordinates, draws and densities those of the parameters. Where the Laplace
-            approximation is not usable (a Hessian with a negative eigenvalue, several modes of similar height, more
-            than 100 parameters), NUTS starts as with "median", at the prior median with a unit mass matrix, and prints
-            one line with the reason. Along flat directions C has variance one. Or a NumPyro strategy.
+            result belong to these, draws and densities to the parameters. Where the Laplace approximation is not usable
+            (a Hessian with a negative eigenvalue, several modes of similar height, more than 100 parameters), NUTS
+            starts as with "median", at the prior median with a unit mass matrix, and prints one line with the reason.
+            Along flat directions C has variance one. Or a NumPyro strategy.
         sampler_options: further arguments of NUTS, `RAM` or `ParticleMarginalRAM`, for example
             ``{"target_accept_prob": 0.95}`` or ``{"particles": 500, "delayed": True}``.
         chain_method: "parallel", "vectorized" or "sequential"; by default parallel where there are as many devices as
