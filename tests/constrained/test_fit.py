@@ -17,7 +17,7 @@ from systems import Linear, whole_state
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.constrained.augmented import COARSE, build_rows
-from lfm_ppl.inference.factor_failures import failures_at, path_ess
+from lfm_ppl.inference.factor_failures import FactorFailures, failures_at, path_ess
 from lfm_ppl.results import arviz_data, convergence, tables
 from lfm_ppl.results.result_view import ResultView
 
@@ -94,7 +94,7 @@ def test_unconverged_factors_and_light_weights_are_counted():
     """The weights of 2 trajectories are worth at most 2; factors converge nowhere at a lengthscale of NaN."""
     bound = lfm.bind(bounded, TIMES, Y, model_kwargs={"draws": 2, "grid": TIMES})
     values = {"lengthscale": np.array([0.5, 1.0, np.nan, 2.0])}
-    assert failures_at(bound, values) == (4, 1, 1)
+    assert failures_at(bound, values) == FactorFailures(4, 1, 1)
     worth = path_ess(bound, {"lengthscale": np.array([0.5, 1.0, 2.0])})
     assert worth.trajectories == 2 and 1.0 <= worth.least <= worth.median <= 2.0
     # Weights by hand, of the data and without them.

@@ -479,7 +479,7 @@ from lfm_ppl.io import loading
 from lfm_ppl.inference.model_digest import model_digest
 file = loading.load("spring")
 data = file.simulate(seed=0)
-print(model_digest(lfm.bind(file.model, data.times, data.y, **file.keywords(data, {}))))
+print(model_digest(lfm.bind(file.model, data.times, data.y, model_kwargs=file.keywords(data, {}))))
 """
     digests = {subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed}, check=True,
                               capture_output=True, text=True).stdout for seed in ("0", "2")}
