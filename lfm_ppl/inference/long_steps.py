@@ -9,6 +9,9 @@ import numpy as np
 from lfm_ppl.inference.bound_model import BoundModel
 from lfm_ppl.likelihoods.likelihood import Likelihood
 
+EXPONENTIAL = "exponential_steps"
+"""Attribute of a result, as JSON: the likelihood sites with exponential steps, because explicit ones were too long."""
+
 
 def long_step_messages(bound: BoundModel, z: np.ndarray, has_method: bool = True) -> list[str]:
     """Return a sentence for each likelihood site with a step that is too long, see `lfm_ppl.filtering.stiffness`.

@@ -26,6 +26,8 @@ from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup
 
 from lfm_ppl.accuracy import report
+from lfm_ppl.inference.long_steps import EXPONENTIAL
+from lfm_ppl.inference.tuning import ANCHOR
 from lfm_ppl.plots import saving
 from lfm_ppl.results import arviz_data, predictions, tables
 from lfm_ppl.results.inputs import ORIGIN
@@ -54,7 +56,8 @@ _DIAGNOSTICS = ["mcse_mean", "ess_bulk", "ess_tail", "r_hat"]
 
 _NOT_SETTINGS = ("model", "model_file", "description", "data", "note", "warnings", "partial", "settings", "run",
                  "map_converged", arviz_data.MODE, "command_line", "call", ORIGIN, "priors", "meanings", "assumptions",
-                 "inference_library", arviz_data.FACTORS, arviz_data.WEIGHTS, arviz_data.DEGENERATE)
+                 "inference_library", arviz_data.FACTORS, arviz_data.WEIGHTS, arviz_data.DEGENERATE, ANCHOR,
+                 EXPONENTIAL)
 """Attributes that stand in other sections, or that only programs read."""
 
 _FILES = re.compile(r"(.*\.nc|(summary|accuracy|forecast|scores)\.csv"

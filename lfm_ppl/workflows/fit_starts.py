@@ -41,7 +41,7 @@ from lfm_ppl.inference.laplace_start import (
     laplace_approximation,
     starting_points,
 )
-from lfm_ppl.inference.long_steps import stiff_sites, with_exponential_steps
+from lfm_ppl.inference.long_steps import EXPONENTIAL, stiff_sites, with_exponential_steps
 from lfm_ppl.inference.map import MAPResult, mode_of
 from lfm_ppl.inference.symmetrising import SymmetrisingTransform, symmetrising_transform
 from lfm_ppl.inference.tuning import ANCHOR, Tuning, anchor_at_mode, anchor_attribute, anchored
@@ -55,9 +55,6 @@ FALLBACK = "init_fallback"
 
 _WARMUP, _SHORT_WARMUP = 1000, 300
 """Default warm-up draws of each chain; the short one is that of NUTS from the Laplace approximation."""
-
-EXPONENTIAL = "exponential_steps"
-"""Attribute of a result, as JSON: the likelihood sites with exponential steps, because explicit ones were too long."""
 
 _SETUP = ("particles", "log_likelihood_sd", "warmup", "init", FALLBACK, EXPONENTIAL, ANCHOR)
 """Attributes that a resumed run needs."""

@@ -19,7 +19,8 @@ from lfm_ppl.forces.sde import ApproximationWarning
 from lfm_ppl.inference import sampling
 from lfm_ppl.inference.bound_model import BoundModel, StartError
 from lfm_ppl.inference.degenerate_mode import degenerate_entries
-from lfm_ppl.inference.long_steps import long_step_messages
+from lfm_ppl.inference.laplace_start import NEGLIGIBLE_RISE
+from lfm_ppl.inference.long_steps import EXPONENTIAL, long_step_messages
 from lfm_ppl.inference.map import check_sites, mode_of
 from lfm_ppl.inference.schedule import Schedule
 from lfm_ppl.inference.start_failure import start_failure
@@ -36,7 +37,7 @@ from lfm_ppl.workflows.fit_results import (
     build_result,
     write_result,
 )
-from lfm_ppl.workflows.fit_starts import EXPONENTIAL, FALLBACK, ChainStart, check_init, find_start
+from lfm_ppl.workflows.fit_starts import FALLBACK, ChainStart, check_init, find_start
 
 _MODE = "mode"
 """Name of the mode and its draws in the folder of a run."""
@@ -163,7 +164,8 @@ def draw_about_mode(problem: FitProblem, store: Checkpoint | None, show_progress
         check_init(options.init)
 
     def compute() -> dict[str, Any]:
-        mode = mode_of(options.keys["mode"], bound, init=None if isinstance(options.init, str) else options.init)
+        init = None if isinstance(options.init, str) else options.init
+        mode = mode_of(options.keys["mode"], bound, init=init, negligible_rise=NEGLIGIBLE_RISE)
         _warn_of_long_steps(problem, mode.mode)
         attributes = {"map_converged": int(mode.converged), "map_message": mode.message,
                       "map_log_density": float(mode.log_density), "log_evidence": float(mode.log_evidence),

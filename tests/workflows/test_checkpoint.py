@@ -22,6 +22,7 @@ import xarray as xr
 import lfm_ppl as lfm
 from lfm_ppl.cli import main
 from lfm_ppl.inference import sampling
+from lfm_ppl.inference.long_steps import EXPONENTIAL
 from lfm_ppl.inference.samplers import SAMPLERS
 from lfm_ppl.inference.tuning import ANCHOR
 from lfm_ppl.results import arviz_data
@@ -30,7 +31,6 @@ from lfm_ppl.storage import checkpoint as checkpoints
 from lfm_ppl.storage import run_record
 from lfm_ppl.storage.checkpoint import Checkpoint
 from lfm_ppl.utils.progress import Progress
-from lfm_ppl.workflows.fit_starts import EXPONENTIAL
 from tests.processes import ROOT
 
 TIMES = np.arange(4.0)
