@@ -223,6 +223,9 @@ def warn_of_named_settings(bound: BoundModel, settings: Mapping[str, Any]) -> No
             if (named := getattr(likelihood.settings, setting)) != value:
                 checks.warn(f"the model names {setting}={named} in its likelihood {name!r}, which stays: {setting}="
                             f"{value} has no effect. lfm.approximate(model, {setting}=...) replaces it.")
+            elif setting == "steps" and (named := likelihood.settings.integration_steps) != value:
+                checks.warn(f"the model names filter_steps={named} in its likelihood {name!r}, which stays: steps="
+                            f"{value} holds for simulations only. lfm.approximate(model, steps=...) replaces both.")
 
 
 def data_by_site(times: Any, y: Any) -> dict[str, Any] | None:

@@ -19,6 +19,7 @@ from lfm_ppl.results.labels import Labels
 from lfm_ppl.results.result_view import ResultView
 from lfm_ppl.results.true_values import checked_truth, unplaced
 from lfm_ppl.workflows import fit_starts
+from lfm_ppl.workflows.data_binding import warn_of_named_settings
 from lfm_ppl.workflows.fit_options import FitOptions
 from tests.inference import linear_motif as motif
 
@@ -583,4 +584,6 @@ def test_settings_that_the_model_leaves_open():
     with pytest.warns(UserWarning, match=r"steps=2 .* 'y'.*steps=5 has no effect.*lfm\.approximate"):
         named = fit(model_kwargs={"steps": 2}, **settings | {"steps": 5})
     assert ResultView.of(named).attrs["steps"] == 2
+    with pytest.warns(UserWarning, match=r"filter_steps=3 .* 'y'.*steps=5 holds for simulations only"):
+        warn_of_named_settings(lfm.bind(lfm.approximate(model, steps=5, filter_steps=3), TIMES, y), {"steps": 5})
     np.testing.assert_allclose(group(named, "posterior")["rate"], group(result, "posterior")["rate"], rtol=1e-6)
