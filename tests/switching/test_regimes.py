@@ -198,8 +198,8 @@ def test_long_records_without_process_noise_have_the_regimes_of_the_truth(mergin
     draws, _ = jax.jit(jax.vmap(lambda key: switching.sample_path(key, y)))(jax.random.split(jax.random.key(0), 20))
     is_right = np.asarray(draws[:, :, 2] == w[:, 2])
     assert is_right.mean() > (0.99 if present == 1 else 0.9)
-    # A change that lies between two rows that are present moves the temperature by 1.8 degrees a row at most.
-    assert np.abs(draws[:, :, 0] - w[:, 0]).max() < (1.0 if present == 1 else 4.0)
+    # A change moves the temperature by 1.8 degrees a row at most, and may be drawn three rows too early or too late.
+    assert np.abs(draws[:, :, 0] - w[:, 0]).max() < (1.0 if present == 1 else 3 * 1.8)
     assert np.sqrt(np.mean((draws[:, :, 0] - w[:, 0]) ** 2)) < (0.2 if present == 1 else 0.6)
 
 
