@@ -15,7 +15,7 @@ from lfm_ppl.inference.trajectories import evenly_spaced, has_noise_of_rows, tra
 from lfm_ppl.io.data_set import Data, on_clock_of_fit
 from lfm_ppl.io.input_table import OF_SERIES
 from lfm_ppl.model.events import Event
-from lfm_ppl.particles.particle_filter import ParticleSettings
+from lfm_ppl.particles.particle_filter import ParticleSettings, check_settings
 from lfm_ppl.results import arviz_data, rebuilding
 from lfm_ppl.results import inputs as known_inputs
 from lfm_ppl.results.predictions import GROUP, HELD_OUT, predictions
@@ -289,7 +289,7 @@ def _forecast(key: jax.Array, view: ResultView, problem: ModelDraws, times: np.n
     attrs = view.attrs
     settings = None
     if str(attrs.get("sampler", "")).startswith("pmmh") and "particles" in attrs:
-        settings = ParticleSettings(int(attrs["particles"]))
+        settings = check_settings(bound.site.example.ssm, ParticleSettings(int(attrs["particles"])))
     paths = trajectories(key, bound, problem.select(rows).draws, None if has_rows else times, settings,
                          report=Console() if progress else None)
     if has_rows:
