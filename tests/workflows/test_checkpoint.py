@@ -52,7 +52,7 @@ def bent(times, y=None):
     """Not linear, so that the iterations of its likelihood start at the mode."""
     noise = numpyro.sample("noise", dist.LogNormal(-0.5, 0.3))
     system = lfm.LatentForceModel(
-        lambda x, u, t: -(x**3), {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
+        lambda x, u, t: -x - 0.2 * x**3, {}, lfm.GaussianObservation(lambda x, u, t: x, jnp.array([0.1])),
         lfm.Gaussian(jnp.array([0.5]), jnp.array([[0.2]])), process_noise=noise * jnp.eye(1))
     numpyro.sample("y", lfm.MarginalLikelihood(system, times, steps=1), obs=y)
 
