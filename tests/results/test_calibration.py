@@ -109,7 +109,7 @@ def test_one_by_one_finds_the_same_ranks(conjugate):
 def test_tasks_in_a_folder_find_the_same_ranks_and_go_on(conjugate, tmp_path):
     lines = []
     for count in (2, 1, 0):
-        result = run(1.0, batch=200, folder=tmp_path, report=lines.append)
+        result = run(1.0, batch=200, checkpoint=tmp_path, report=lines.append)
         for name, rank in conjugate[0].ranks.items():
             np.testing.assert_array_equal(result.ranks[name], rank)
         assert sum("data-sets/" in line for line in lines) == count
